@@ -1,0 +1,303 @@
+"""The scene records: what a scene file says, typed.
+
+Every importer produces these records and everything downstream reads only them. The JSON Schema of the scene
+format is generated from them, so a field's description here is its documentation there.
+
+Conventions: right-handed, Y up, metres, degrees; linear Rec. 709 colour. UV (0, 0) is the upper left corner of an
+image (first row of the file), as in glTF. A camera looks along its local -Z with +X to the right and +Y up.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+NonNegative = Annotated[float, Meta(ge=0.0)]
+Positive = Annotated[float, Meta(gt=0.0)]
+Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
+Vec2 = tuple[float, float]
+Vec3 = tuple[float, float, float]
+Vec4 = tuple[float, float, float, float]
+
+# Three numbers as a list of fixed length: msgspec 0.22 corrupts memory where one union holds both a constrained
+# float and a fixed-length tuple.
+RGB = Annotated[list[NonNegative], Meta(min_length=3, max_length=3)]
+RGBFraction = Annotated[list[Fraction], Meta(min_length=3, max_length=3)]
+
+
+class Record(msgspec.Struct, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Base of all scene records: keyword-only, unknown keys refused, defaults left out when written."""
+
+
+# --- transforms ------------------------------------------------------------------------------------------------
+
+
+class LookAt(Record):
+    origin: Annotated[Vec3, Meta(description="Position of the viewer.")]
+    target: Annotated[Vec3, Meta(description="Point that local -Z points at.")]
+    up: Annotated[Vec3, Meta(description="Direction that local +Y leans to.")] = (0.0, 1.0, 0.0)
+
+
+class Rotate(Record):
+    axis: Vec3
+    angle: Annotated[float, Meta(description="Degrees, counter-clockwise seen against the axis.")]
+
+
+class TransformStep(Record):
+    """One step of a transform; exactly one key is given."""
+
+    translate: Vec3 | None = None
+    rotate: Rotate | None = None
+    scale: float | Vec3 | None = None
+    look_at: LookAt | None = None
+    matrix: tuple[Vec4, Vec4, Vec4, Vec4] | None = None
+
+
+# Four rows of four numbers (column vectors), or steps of which the first is applied first.
+Transform = Annotated[
+    list[TransformStep | Vec4],
+    Meta(description="Four rows of a 4x4 matrix that acts on column vectors, or a list of steps; the first step is applied first."),
+]
+
+# --- textures --------------------------------------------------------------------------------------------------
+
+UVTransform = Annotated[
+    tuple[Vec3, Vec3],
+    Meta(description="Rows of a 2x3 matrix that maps (u, v, 1) of the surface to the texture."),
+]
+IDENTITY_UV = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+
+
+class Bitmap(Record, tag_field="type", tag="bitmap"):
+    """An image file: PNG or JPEG (8 bit), or OpenEXR."""
+
+    file: Annotated[str, Meta(description="Path of the image, relative to the scene file.", min_length=1)]
+    name: str = ""
+    color_space: Annotated[
+        Literal["auto", "srgb", "linear"],
+        Meta(description="How values are encoded; auto: 8-bit colours are sRGB, OpenEXR and scalar parameters are linear."),
+    ] = "auto"
+    filter: Literal["bilinear", "nearest"] = "bilinear"
+    wrap: Literal["repeat", "mirror", "clamp"] = "repeat"
+    uv_transform: UVTransform = IDENTITY_UV
+
+
+class Checkerboard(Record, tag_field="type", tag="checkerboard"):
+    """Two colours in a 2x2 pattern per unit of UV: color0 where both halves agree, color1 elsewhere."""
+
+    name: str = ""
+    color0: NonNegative | RGB = 0.4
+    color1: NonNegative | RGB = 0.2
+    uv_transform: UVTransform = IDENTITY_UV
+
+
+Texture = Bitmap | Checkerboard
+
+# A grey value, a colour, the name of a texture, or a texture. Only the range differs between the kinds.
+Reflectance = Fraction | RGBFraction | str | Bitmap | Checkerboard
+Radiance = NonNegative | RGB | str | Bitmap | Checkerboard
+Spectrum = Radiance  # unbounded above: eta and k of a conductor
+Alpha = Annotated[float, Meta(ge=1e-4, le=1.0)] | str | Bitmap | Checkerboard
+Opacity = Fraction | str | Bitmap | Checkerboard
+
+# --- BSDFs -----------------------------------------------------------------------------------------------------
+
+Distribution = Literal["ggx", "beckmann"]
+
+
+class Diffuse(Record, tag_field="type", tag="diffuse"):
+    """Lambertian reflection, one-sided."""
+
+    name: str = ""
+    reflectance: Reflectance = 0.5
+
+
+class Conductor(Record, tag_field="type", tag="conductor"):
+    """Smooth conductor with a complex index of refraction."""
+
+    name: str = ""
+    material: Annotated[str | None, Meta(description="Named metal; excludes eta and k.")] = None
+    eta: Spectrum | None = None
+    k: Spectrum | None = None
+    specular_reflectance: Reflectance = 1.0
+
+
+class RoughConductor(Record, tag_field="type", tag="rough_conductor"):
+    """Conductor with a microfacet surface, isotropic."""
+
+    name: str = ""
+    material: Annotated[str | None, Meta(description="Named metal; excludes eta and k.")] = None
+    eta: Spectrum | None = None
+    k: Spectrum | None = None
+    specular_reflectance: Reflectance = 1.0
+    alpha: Annotated[Alpha, Meta(description="Microfacet roughness (root mean square slope for Beckmann).")] = 0.1
+    distribution: Distribution = "ggx"
+
+
+IOR = Annotated[float, Meta(gt=0.0)] | str
+
+
+class Dielectric(Record, tag_field="type", tag="dielectric"):
+    """Smooth boundary between two dielectrics; the normal points to the exterior."""
+
+    name: str = ""
+    int_ior: Annotated[IOR, Meta(description="Interior index of refraction, or a name such as water, bk7, diamond.")] = 1.5046
+    ext_ior: Annotated[IOR, Meta(description="Exterior index of refraction, or a name.")] = 1.000277
+    specular_reflectance: Reflectance = 1.0
+    specular_transmittance: Reflectance = 1.0
+
+
+class RoughDielectric(Record, tag_field="type", tag="rough_dielectric"):
+    """Boundary between two dielectrics with a microfacet surface, isotropic."""
+
+    name: str = ""
+    int_ior: Annotated[IOR, Meta(description="Interior index of refraction, or a name such as water, bk7, diamond.")] = 1.5046
+    ext_ior: Annotated[IOR, Meta(description="Exterior index of refraction, or a name.")] = 1.000277
+    specular_reflectance: Reflectance = 1.0
+    specular_transmittance: Reflectance = 1.0
+    alpha: Annotated[Alpha, Meta(description="Microfacet roughness (root mean square slope for Beckmann).")] = 0.1
+    distribution: Distribution = "ggx"
+
+
+class TwoSided(Record, tag_field="type", tag="twosided"):
+    """A reflecting BSDF on both sides of a surface; `back` defaults to `front`."""
+
+    front: Annotated[str | Bsdf, Meta(description="Name of a BSDF, or a BSDF.")]
+    name: str = ""
+    back: str | Bsdf | None = None
+
+
+class Mask(Record, tag_field="type", tag="mask"):
+    """Opacity: the surface is there with probability `opacity`, else light passes straight through."""
+
+    bsdf: Annotated[str | Bsdf, Meta(description="Name of a BSDF, or a BSDF.")]
+    name: str = ""
+    opacity: Opacity = 0.5
+
+
+Bsdf = Diffuse | Conductor | RoughConductor | Dielectric | RoughDielectric | TwoSided | Mask
+
+# --- emitters --------------------------------------------------------------------------------------------------
+
+
+class Area(Record, tag_field="type", tag="area"):
+    """Diffuse emission from the front of a shape."""
+
+    radiance: Annotated[Radiance, Meta(description="W / (m^2 sr)")] = 1.0
+
+
+class Constant(Record, tag_field="type", tag="constant"):
+    """An environment of the same radiance from every direction."""
+
+    name: str = ""
+    radiance: NonNegative | RGB = 1.0
+
+
+Emitter = Constant
+
+# --- shapes ----------------------------------------------------------------------------------------------------
+
+
+class Shape(Record):
+    """What all shapes share."""
+
+    name: str = ""
+    bsdf: Annotated[str | Bsdf | None, Meta(description="Name of a BSDF, or a BSDF; default: diffuse, 0.5.")] = None
+    emitter: Annotated[Area | None, Meta(description="Makes the shape an area light.")] = None
+    to_world: Transform = []
+    flip_normals: bool = False
+
+
+class Mesh(Shape, tag_field="type", tag="mesh"):
+    """Triangles from a PLY, OBJ or glTF file, or inline. UVs and normals are per vertex."""
+
+    file: Annotated[str | None, Meta(description="PLY, OBJ, glTF or GLB, relative to the scene file; excludes vertices and faces.")] = None
+    vertices: list[Vec3] | None = None
+    faces: list[tuple[int, int, int]] | None = None
+    normals: list[Vec3] | None = None
+    uvs: list[Vec2] | None = None
+    face_normals: Annotated[bool, Meta(description="Ignore vertex normals: shade every triangle flat.")] = False
+    flip_v: Annotated[bool | None, Meta(description="Turn v into 1 - v; default: for OBJ files only.")] = None
+
+
+class Rectangle(Shape, tag_field="type", tag="rectangle"):
+    """The square [-1, 1]^2 at z = 0, facing +Z."""
+
+
+class Cube(Shape, tag_field="type", tag="cube"):
+    """The cube [-1, 1]^3, facing outwards."""
+
+
+class Disk(Shape, tag_field="type", tag="disk"):
+    """The unit disk at z = 0, facing +Z, as a fine fan of triangles of the same area."""
+
+
+class Sphere(Shape, tag_field="type", tag="sphere"):
+    """An exact sphere, facing outwards. `to_world` must scale uniformly."""
+
+    center: Vec3 = (0.0, 0.0, 0.0)
+    radius: Positive = 1.0
+
+
+AnyShape = Mesh | Rectangle | Cube | Disk | Sphere
+
+# --- camera, film, integrator ------------------------------------------------------------------------------------
+
+
+class Perspective(Record, tag_field="type", tag="perspective"):
+    """Pinhole camera."""
+
+    fov: Annotated[float, Meta(gt=0.0, lt=180.0, description="Field of view along fov_axis, degrees.")] = 40.0
+    fov_axis: Literal["x", "y", "diagonal", "smaller", "larger"] = "x"
+    to_world: Transform = []
+
+
+class BoxFilter(Record, tag_field="type", tag="box"):
+    """Half a pixel in each direction."""
+
+
+class TentFilter(Record, tag_field="type", tag="tent"):
+    radius: Annotated[Positive, Meta(description="Pixels.")] = 1.0
+
+
+class GaussianFilter(Record, tag_field="type", tag="gaussian"):
+    """Truncated at four standard deviations."""
+
+    stddev: Annotated[Positive, Meta(description="Pixels.")] = 0.5
+
+
+Filter = BoxFilter | TentFilter | GaussianFilter
+Aov = Literal["albedo", "normal", "depth", "variance"]
+
+
+class Film(Record):
+    width: Annotated[int, Meta(ge=1, le=65536)] = 512
+    height: Annotated[int, Meta(ge=1, le=65536)] = 512
+    filter: Filter = msgspec.field(default_factory=BoxFilter)
+    aovs: Annotated[list[Aov], Meta(description="Extra channels: first-hit albedo, shading normal, depth; variance of the mean luminance.")] = []
+    precision: Annotated[Literal["float", "half"], Meta(description="Of the EXR file; half overflows at 65504.")] = "float"
+
+
+class PathIntegrator(Record, tag_field="type", tag="path"):
+    """Unidirectional path tracing with multiple importance sampling."""
+
+    max_depth: Annotated[int, Meta(ge=1, le=1_000_000, description="Longest path in segments: 1 is emission seen directly, 2 adds direct light.")] = 16
+    rr_depth: Annotated[Annotated[int, Meta(ge=1)] | None, Meta(description="Depth from which Russian roulette may end a path; null: never.")] = 5
+    nee: Annotated[bool, Meta(description="Next-event estimation; false: emitters are found by BSDF sampling only.")] = True
+    spp: Annotated[int, Meta(ge=1, le=2**31 - 1, description="Samples per pixel.")] = 64
+
+
+class Scene(Record):
+    """A whole scene. File paths in memory are absolute; in a file they are relative to it."""
+
+    shapes: Annotated[list[AnyShape], Meta(description="What is in the scene.")] = []
+    camera: Perspective = msgspec.field(default_factory=Perspective)
+    film: Film = msgspec.field(default_factory=Film)
+    integrator: PathIntegrator = msgspec.field(default_factory=PathIntegrator)
+    textures: Annotated[list[Texture], Meta(description="Named textures.")] = []
+    bsdfs: Annotated[list[Bsdf], Meta(description="Named BSDFs.")] = []
+    emitters: Annotated[list[Emitter], Meta(description="Emitters that are not shapes; at most one constant environment.")] = []
+    include: Annotated[list[str], Meta(description="Scene files whose textures, bsdfs, emitters and shapes are added to this one.")] = []
+    description: Annotated[str, Meta(description="What the scene is for.")] = ""
