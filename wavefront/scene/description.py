@@ -219,6 +219,7 @@ class Mesh(Shape, tag_field="type", tag="mesh"):
     normals: list[Vec3] | None = None
     uvs: list[Vec2] | None = None
     face_normals: Annotated[bool, Meta(description="Ignore vertex normals: shade every triangle flat.")] = False
+    smooth_normals: Annotated[bool, Meta(description="Compute vertex normals where there are none: means of the face normals weighted by angle.")] = False
     flip_v: Annotated[bool | None, Meta(description="Turn v into 1 - v; default: for OBJ files only.")] = None
 
 

@@ -1,0 +1,282 @@
+"""Runs the BSDF functions over arrays.
+
+`SAMPLERS` and `EVALUATORS` hold one kernel per BSDF, all with the same interface, so that a test is written once for
+every BSDF. The kernels of this file form one module, which is compiled once for all tests.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from wavefront.bsdf.conductor import sample_conductor
+from wavefront.bsdf.dielectric import sample_dielectric
+from wavefront.bsdf.diffuse import eval_diffuse, sample_diffuse
+from wavefront.bsdf.fresnel import fresnel_conductor, fresnel_dielectric
+from wavefront.bsdf.microfacet import (
+    microfacet_d,
+    sample_visible_normal,
+    smith_g1,
+    visible_normal_pdf,
+)
+from wavefront.bsdf.record import BsdfEval, BsdfSample
+from wavefront.bsdf.rough_conductor import eval_rough_conductor, sample_rough_conductor
+from wavefront.bsdf.rough_dielectric import eval_rough_dielectric, sample_rough_dielectric
+
+DEVICE = "cpu"
+LARGEST_UNIFORM = 1.0 - 2.0**-24
+
+
+@wp.struct
+class Parameters:
+    """Parameters of every BSDF under test; each reads its own."""
+
+    reflectance: wp.vec3
+    transmittance: wp.vec3
+    eta: wp.vec3
+    k: wp.vec3
+    ior: float
+    alpha: float
+    distribution: int
+
+
+@wp.func
+def call_sample_diffuse(p: Parameters, wo: wp.vec3, u: wp.vec3):
+    return sample_diffuse(p.reflectance, wo, u)
+
+
+@wp.func
+def call_sample_conductor(p: Parameters, wo: wp.vec3, u: wp.vec3):
+    return sample_conductor(p.eta, p.k, p.reflectance, wo, u)
+
+
+@wp.func
+def call_sample_rough_conductor(p: Parameters, wo: wp.vec3, u: wp.vec3):
+    return sample_rough_conductor(p.eta, p.k, p.reflectance, p.alpha, p.distribution, wo, u)
+
+
+@wp.func
+def call_sample_dielectric(p: Parameters, wo: wp.vec3, u: wp.vec3):
+    return sample_dielectric(p.ior, p.reflectance, p.transmittance, wo, u)
+
+
+@wp.func
+def call_sample_rough_dielectric(p: Parameters, wo: wp.vec3, u: wp.vec3):
+    return sample_rough_dielectric(p.ior, p.reflectance, p.transmittance, p.alpha, p.distribution, wo, u)
+
+
+@wp.func
+def call_eval_diffuse(p: Parameters, wo: wp.vec3, wi: wp.vec3):
+    return eval_diffuse(p.reflectance, wo, wi)
+
+
+@wp.func
+def call_eval_rough_conductor(p: Parameters, wo: wp.vec3, wi: wp.vec3):
+    return eval_rough_conductor(p.eta, p.k, p.reflectance, p.alpha, p.distribution, wo, wi)
+
+
+@wp.func
+def call_eval_rough_dielectric(p: Parameters, wo: wp.vec3, wi: wp.vec3):
+    return eval_rough_dielectric(p.ior, p.reflectance, p.transmittance, p.alpha, p.distribution, wo, wi)
+
+
+def _sample_kernel(function):
+    @wp.kernel(enable_backward=False, module="unique")
+    def sample_kernel(
+        p: Parameters,
+        wo: wp.array(dtype=wp.vec3),
+        u: wp.array(dtype=wp.vec3),
+        # outputs
+        samples: wp.array(dtype=BsdfSample),
+    ):
+        i = wp.tid()
+        samples[i] = function(p, wo[i], u[i])
+
+    return sample_kernel
+
+
+def _eval_kernel(function):
+    @wp.kernel(enable_backward=False, module="unique")
+    def eval_kernel(
+        p: Parameters,
+        wo: wp.array(dtype=wp.vec3),
+        wi: wp.array(dtype=wp.vec3),
+        # outputs
+        evals: wp.array(dtype=BsdfEval),
+    ):
+        i = wp.tid()
+        evals[i] = function(p, wo[i], wi[i])
+
+    return eval_kernel
+
+
+_SAMPLE_KERNELS = {
+    "diffuse": _sample_kernel(call_sample_diffuse),
+    "conductor": _sample_kernel(call_sample_conductor),
+    "rough_conductor": _sample_kernel(call_sample_rough_conductor),
+    "dielectric": _sample_kernel(call_sample_dielectric),
+    "rough_dielectric": _sample_kernel(call_sample_rough_dielectric),
+}
+_EVAL_KERNELS = {
+    "diffuse": _eval_kernel(call_eval_diffuse),
+    "rough_conductor": _eval_kernel(call_eval_rough_conductor),
+    "rough_dielectric": _eval_kernel(call_eval_rough_dielectric),
+}
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _normals_kernel(
+    wo: wp.array(dtype=wp.vec3),
+    u: wp.array(dtype=wp.vec3),
+    alpha: float,
+    distribution: int,
+    # outputs
+    m: wp.array(dtype=wp.vec3),
+):
+    i = wp.tid()
+    m[i] = sample_visible_normal(wo[i], alpha, distribution, wp.vec2(u[i][0], u[i][1]))
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _terms_kernel(
+    wo: wp.array(dtype=wp.vec3),
+    m: wp.array(dtype=wp.vec3),
+    alpha: float,
+    distribution: int,
+    # outputs
+    terms: wp.array(dtype=wp.vec3),
+):
+    i = wp.tid()
+    terms[i] = wp.vec3(
+        microfacet_d(m[i], alpha, distribution),
+        smith_g1(wo[i], alpha, distribution),
+        visible_normal_pdf(wo[i], m[i], alpha, distribution),
+    )
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _fresnel_kernel(
+    cos_i: wp.array(dtype=float),
+    ior: float,
+    eta: wp.vec3,
+    k: wp.vec3,
+    # outputs
+    dielectric: wp.array(dtype=wp.vec4),
+    conductor: wp.array(dtype=wp.vec3),
+):
+    i = wp.tid()
+    f = fresnel_dielectric(cos_i[i], ior)
+    dielectric[i] = wp.vec4(f.reflectance, f.cos_t, f.eta, f.inv_eta)
+    conductor[i] = fresnel_conductor(cos_i[i], eta, k)
+
+
+@dataclass(frozen=True)
+class Sample:
+    wi: np.ndarray
+    weight: np.ndarray
+    pdf: np.ndarray
+    eta: np.ndarray
+
+
+@dataclass(frozen=True)
+class Eval:
+    value: np.ndarray
+    pdf: np.ndarray
+
+
+def parameters(
+    reflectance=(1.0, 1.0, 1.0),
+    transmittance=(1.0, 1.0, 1.0),
+    eta=(0.0, 0.0, 0.0),
+    k=(1.0, 1.0, 1.0),
+    ior=1.5,
+    alpha=0.1,
+    distribution=0,
+) -> Parameters:
+    """White by default: a perfect mirror, or a boundary that absorbs nothing."""
+    p = Parameters()
+    p.reflectance = wp.vec3(*reflectance)
+    p.transmittance = wp.vec3(*transmittance)
+    p.eta = wp.vec3(*eta)
+    p.k = wp.vec3(*k)
+    p.ior = float(ior)
+    p.alpha = float(alpha)
+    p.distribution = int(distribution)
+    return p
+
+
+def vectors(a, n: int) -> np.ndarray:
+    """(n, 3) float32 from one direction or many."""
+    return np.ascontiguousarray(np.broadcast_to(np.asarray(a, dtype=np.float32), (n, 3)))
+
+
+def _in(a: np.ndarray) -> wp.array:
+    return wp.array(a, dtype=wp.vec3, device=DEVICE)
+
+
+def sample(name: str, p: Parameters, wo, u) -> Sample:
+    n = len(u)
+    out = wp.empty(n, dtype=BsdfSample, device=DEVICE)
+    inputs = [p, _in(vectors(wo, n)), _in(vectors(u, n))]
+    wp.launch(_SAMPLE_KERNELS[name], dim=n, inputs=inputs, outputs=[out], device=DEVICE)
+    s = out.numpy()
+    return Sample(s["wi"], s["weight"], s["pdf"], s["eta"])
+
+
+def evaluate(name: str, p: Parameters, wo, wi) -> Eval:
+    n = max(len(np.atleast_2d(wo)), len(np.atleast_2d(wi)))
+    out = wp.empty(n, dtype=BsdfEval, device=DEVICE)
+    inputs = [p, _in(vectors(wo, n)), _in(vectors(wi, n))]
+    wp.launch(_EVAL_KERNELS[name], dim=n, inputs=inputs, outputs=[out], device=DEVICE)
+    e = out.numpy()
+    return Eval(e["value"], e["pdf"])
+
+
+def visible_normals(wo, alpha: float, distribution: int, u) -> np.ndarray:
+    n = len(u)
+    m = wp.empty(n, dtype=wp.vec3, device=DEVICE)
+    inputs = [_in(vectors(wo, n)), _in(vectors(u, n)), alpha, distribution]
+    wp.launch(_normals_kernel, dim=n, inputs=inputs, outputs=[m], device=DEVICE)
+    return m.numpy()
+
+
+def microfacet_terms(wo, m, alpha: float, distribution: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """D(m), G1(wo), and the density of the visible normal m."""
+    n = max(len(np.atleast_2d(wo)), len(np.atleast_2d(m)))
+    terms = wp.empty(n, dtype=wp.vec3, device=DEVICE)
+    inputs = [_in(vectors(wo, n)), _in(vectors(m, n)), alpha, distribution]
+    wp.launch(_terms_kernel, dim=n, inputs=inputs, outputs=[terms], device=DEVICE)
+    d, g1, pdf = terms.numpy().T
+    return d, g1, pdf
+
+
+def fresnel(cos_i, ior: float = 1.5, eta=(0.0, 0.0, 0.0), k=(1.0, 1.0, 1.0)) -> tuple[np.ndarray, np.ndarray]:
+    """Dielectric rows (reflectance, cos_t, eta, 1 / eta), and conductor reflectances."""
+    c = np.ascontiguousarray(cos_i, dtype=np.float32)
+    dielectric = wp.empty(len(c), dtype=wp.vec4, device=DEVICE)
+    conductor = wp.empty(len(c), dtype=wp.vec3, device=DEVICE)
+    inputs = [wp.array(c, dtype=float, device=DEVICE), ior, wp.vec3(*eta), wp.vec3(*k)]
+    wp.launch(_fresnel_kernel, dim=len(c), inputs=inputs, outputs=[dielectric, conductor], device=DEVICE)
+    return dielectric.numpy(), conductor.numpy()
+
+
+def direction(theta_cos: float, phi: float = 0.4) -> np.ndarray:
+    """Unit vector with the given z, in float64."""
+    s = np.sqrt(max(0.0, (1.0 - theta_cos) * (1.0 + theta_cos)))
+    return np.array([s * np.cos(phi), s * np.sin(phi), theta_cos])
+
+
+def uniforms(n: int, seed: int) -> np.ndarray:
+    """(n, 3) multiples of 2^-24 in [0, 1), as the renderer makes them."""
+    bits = np.random.default_rng(seed).integers(0, 2**24, size=(n, 3))
+    return (bits * 2.0**-24).astype(np.float32)
+
+
+def random_directions(n: int, seed: int, hemisphere: bool = False) -> np.ndarray:
+    v = np.random.default_rng(seed).normal(size=(n, 3))
+    v /= np.linalg.norm(v, axis=1, keepdims=True)
+    if hemisphere:
+        v[:, 2] = np.abs(v[:, 2])
+    return v.astype(np.float32)

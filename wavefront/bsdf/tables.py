@@ -1,0 +1,72 @@
+"""Materials on the device: one table of records per kind of BSDF, and a table of materials that names them.
+
+Two-sidedness and opacity are properties of a material; what remains of a BSDF has one record in its kind's table.
+Each parameter is a value and the index of a texture that replaces it (-1: none).
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+KIND_NONE = wp.constant(0)  # absorbs: the back of a one-sided surface
+KIND_DIFFUSE = wp.constant(1)
+KIND_CONDUCTOR = wp.constant(2)
+KIND_ROUGH_CONDUCTOR = wp.constant(3)
+KIND_DIELECTRIC = wp.constant(4)
+KIND_ROUGH_DIELECTRIC = wp.constant(5)
+KINDS = {"diffuse": 1, "conductor": 2, "rough_conductor": 3, "dielectric": 4, "rough_dielectric": 5}
+TRANSMISSIVE = ("dielectric", "rough_dielectric")
+DELTA = ("conductor", "dielectric")
+
+
+@wp.struct
+class Material:
+    front: wp.int32  # kind on the side of the normal, and its record
+    front_index: wp.int32
+    back: wp.int32
+    back_index: wp.int32
+    opacity: wp.float32
+    opacity_texture: wp.int32
+
+
+@wp.struct
+class DiffuseRecord:
+    reflectance: wp.vec3
+    reflectance_texture: wp.int32
+
+
+@wp.struct
+class ConductorRecord:
+    """Smooth and rough; `alpha` and `distribution` are read for rough conductors only."""
+
+    eta: wp.vec3
+    eta_texture: wp.int32
+    k: wp.vec3
+    k_texture: wp.int32
+    reflectance: wp.vec3
+    reflectance_texture: wp.int32
+    alpha: wp.float32
+    alpha_texture: wp.int32
+    distribution: wp.int32
+
+
+@wp.struct
+class DielectricRecord:
+    """Smooth and rough; `alpha` and `distribution` are read for rough dielectrics only."""
+
+    eta: wp.float32  # interior over exterior index of refraction
+    reflectance: wp.vec3
+    reflectance_texture: wp.int32
+    transmittance: wp.vec3
+    transmittance_texture: wp.int32
+    alpha: wp.float32
+    alpha_texture: wp.int32
+    distribution: wp.int32
+
+
+@wp.struct
+class MaterialTables:
+    materials: wp.array[Material]
+    diffuse: wp.array[DiffuseRecord]
+    conductor: wp.array[ConductorRecord]
+    dielectric: wp.array[DielectricRecord]

@@ -1,0 +1,56 @@
+"""What a scene and its settings require: the frozen key that kernels are built for.
+
+Every stage takes only the parts it reads, so that scenes which differ elsewhere share its compiled kernel.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True)
+class Features:
+    # Geometry
+    triangles: bool  # some shape is a mesh
+    spheres: bool
+    smooth: bool  # some mesh has vertex normals
+    uvs: bool  # some texture is looked up
+
+    # Materials
+    bsdfs: tuple[str, ...]  # kinds, sorted
+    mask: bool  # some material is not opaque
+    textures: tuple[str, ...]  # kinds, sorted
+
+    # Lights
+    lights: tuple[str, ...]  # kinds, sorted; empty if nothing emits
+    light_textures: tuple[str, ...]  # kinds of texture that emitters have
+
+    # Integrator and film
+    nee: bool
+    roulette: bool
+    filter: str
+    aovs: tuple[str, ...]  # of the first hit
+    variance: bool
+
+    @property
+    def transmission(self) -> bool:
+        """Whether a path can cross into another medium, so that radiance scales with the index of refraction."""
+        return "dielectric" in self.bsdfs or "rough_dielectric" in self.bsdfs
+
+    @property
+    def smooth_bsdfs(self) -> bool:
+        """Whether a light sample can contribute anywhere."""
+        return any(kind in ("diffuse", "rough_conductor", "rough_dielectric") for kind in self.bsdfs)
+
+    @property
+    def environment(self) -> bool:
+        return "constant" in self.lights
+
+    @property
+    def area_lights(self) -> bool:
+        return "triangle" in self.lights or "sphere" in self.lights
+
+    @property
+    def light_sampling(self) -> bool:
+        """Whether the direct-light and shadow stages exist."""
+        return self.nee and bool(self.lights) and self.smooth_bsdfs

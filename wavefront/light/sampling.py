@@ -1,0 +1,189 @@
+"""Light selection by power, and sampling of a point on the selected light."""
+
+from __future__ import annotations
+
+import functools
+
+import warp as wp
+
+from wavefront.accel.mesh_query import INFINITE, Geometry
+from wavefront.light.tables import KIND_CONSTANT, KIND_SPHERE, KIND_TRIANGLE, LightTables
+from wavefront.surface import position_error, sphere_uv
+from wavefront.texture import TextureTables, make_eval_parameter
+from wavefront.warp_samples import (
+    cone_pdf,
+    orthonormal_basis,
+    sphere_pdf,
+    square_to_cone,
+    square_to_sphere,
+    square_to_triangle,
+    to_world,
+)
+
+
+@wp.struct
+class LightSample:
+    wi: wp.vec3  # unit vector towards the light
+    target: wp.vec3  # where the shadow ray ends; unused for the environment
+    t_max: wp.float32  # of a shadow ray to the target: 1, or INFINITE for the environment
+    L: wp.vec3  # emitted radiance; zero if the sample is useless
+    pdf: wp.float32  # in solid angle, selection included
+
+
+@wp.func
+def select_light(lights: LightTables, u: float) -> int:
+    """Index of a light drawn from the alias table."""
+    n = lights.lights.shape[0]
+    scaled = u * float(n)
+    cell = wp.min(int(scaled), n - 1)
+    light = lights.lights[cell]
+    return wp.where(scaled - float(cell) < light.alias_threshold, cell, light.alias)
+
+
+@wp.func
+def sphere_cone(sphere: wp.vec4, p: wp.vec3) -> float:
+    """1 - cos of the half angle under which a sphere is seen from p; 0 from inside or on it."""
+    to_center = wp.vec3(sphere[0], sphere[1], sphere[2]) - p
+    distance2 = wp.dot(to_center, to_center)
+    r2 = sphere[3] * sphere[3]
+    if distance2 <= r2 * 1.00001:
+        return 0.0
+    sin2 = r2 / distance2
+    return sin2 / (1.0 + wp.sqrt(1.0 - sin2))
+
+
+@functools.cache
+def make_light_sampler(kinds: tuple[str, ...], textures: tuple[str, ...]):
+    """Sampling of the kinds of light in a scene.
+
+    Args:
+        kinds: Names of the kinds, from `tables.KINDS`.
+        textures: Kinds of texture that emitters may have.
+
+    Returns:
+        `sample_light(lights, geometry, textures, p, u) -> LightSample` for a point p, and
+        `light_pdf(lights, geometry, light, p, wi, q, normal) -> float`, the density in solid angle with which that
+        would have chosen the point q (with its normal) of a light, seen from p in direction wi.
+    """
+    has_triangle = "triangle" in kinds
+    has_sphere = "sphere" in kinds
+    has_constant = "constant" in kinds
+    textured = bool(textures)
+    eval_parameter = make_eval_parameter(textures)
+
+    @wp.func
+    def sample_light(
+        lights: LightTables, geometry: Geometry, textures: TextureTables, p: wp.vec3, u: wp.vec3
+    ) -> LightSample:
+        result = LightSample()
+        result.t_max = 1.0
+        light = lights.lights[select_light(lights, u[0])]
+        emitter = lights.emitters[light.emitter]
+        if wp.static(has_triangle):
+            if light.kind == KIND_TRIANGLE:
+                i0 = geometry.indices[3 * light.primitive]
+                i1 = geometry.indices[3 * light.primitive + 1]
+                i2 = geometry.indices[3 * light.primitive + 2]
+                v0 = geometry.points[i0]
+                v1 = geometry.points[i1]
+                v2 = geometry.points[i2]
+                b12 = square_to_triangle(wp.vec2(u[1], u[2]))
+                b = wp.vec2(1.0 - b12[0] - b12[1], b12[0])
+                b2 = b12[1]
+                q = b[0] * v0 + b[1] * v1 + b2 * v2
+                to_light = q - p
+                distance2 = wp.dot(to_light, to_light)
+                wi = wp.normalize(to_light)
+                cross = wp.cross(v1 - v0, v2 - v0)
+                normal = wp.normalize(cross)
+                shading_normal = normal
+                if geometry.shapes[geometry.shape_of[light.primitive]].smooth == 1:
+                    shading_normal = b[0] * geometry.normals[i0] + b[1] * geometry.normals[i1]
+                    shading_normal += b2 * geometry.normals[i2]
+                if wp.dot(shading_normal, normal) < 0.0:
+                    normal = -normal
+                # Emission is towards the front of the geometric normal; the density in area, 2 / |cross|, becomes one
+                # in solid angle by distance^2 / cos.
+                cos_light = -wp.dot(normal, wi)
+                if cos_light > 0.0:
+                    result.wi = wi
+                    result.target = q + position_error(v0, v1, v2, b[0], b[1], normal) * normal
+                    result.pdf = light.pmf * 2.0 * distance2 / (cos_light * wp.length(cross))
+                    uv = wp.vec2(0.0)
+                    if wp.static(textured):
+                        uv = b[0] * geometry.uvs[i0] + b[1] * geometry.uvs[i1] + b2 * geometry.uvs[i2]
+                    result.L = eval_parameter(textures, emitter.radiance, emitter.radiance_texture, uv)
+        if wp.static(has_sphere):
+            if light.kind == KIND_SPHERE:
+                sphere = geometry.spheres[light.primitive - geometry.triangle_count]
+                inwards = geometry.shapes[geometry.shape_of[light.primitive]].flip == 1
+                center = wp.vec3(sphere[0], sphere[1], sphere[2])
+                r = sphere[3]
+                one_minus_cos = sphere_cone(sphere, p)
+                normal = wp.vec3(0.0)
+                if one_minus_cos > 0.0:
+                    to_center = center - p
+                    distance = wp.length(to_center)
+                    local = square_to_cone(wp.vec2(u[1], u[2]), one_minus_cos)
+                    axis = to_center / distance
+                    s, t = orthonormal_basis(axis)
+                    wi = to_world(s, t, axis, local)
+                    # Near intersection of the sampled ray, then put back exactly onto the sphere.
+                    sin2 = local[0] * local[0] + local[1] * local[1]
+                    t_near = distance * local[2] - wp.sqrt(wp.max(r * r - distance * distance * sin2, 0.0))
+                    normal = wp.normalize(p + t_near * wi - center)
+                    result.wi = wi
+                    result.pdf = light.pmf * cone_pdf(one_minus_cos)
+                    result.L = wp.where(inwards, wp.vec3(0.0), emitter.radiance)
+                else:
+                    normal = square_to_sphere(wp.vec2(u[1], u[2]))
+                    to_light = center + r * normal - p
+                    wi = wp.normalize(to_light)
+                    cos_light = wp.where(inwards, wp.dot(normal, wi), -wp.dot(normal, wi))
+                    if cos_light > 0.0:
+                        result.wi = wi
+                        result.pdf = light.pmf * sphere_pdf() * wp.dot(to_light, to_light) / (cos_light * r * r)
+                        result.L = emitter.radiance
+                error = 1.0e-6 * (r + wp.max(wp.abs(center)))
+                result.target = center + (r + wp.where(inwards, -error, error)) * normal
+                if wp.static(textured):
+                    if result.L[0] + result.L[1] + result.L[2] > 0.0 and emitter.radiance_texture >= 0:
+                        local_normal = geometry.sphere_to_local[light.primitive - geometry.triangle_count] * normal
+                        uv = sphere_uv(local_normal)
+                        result.L = eval_parameter(textures, emitter.radiance, emitter.radiance_texture, uv)
+        if wp.static(has_constant):
+            if light.kind == KIND_CONSTANT:
+                result.wi = square_to_sphere(wp.vec2(u[1], u[2]))
+                result.t_max = INFINITE
+                result.pdf = light.pmf * sphere_pdf()
+                result.L = emitter.radiance
+        return result
+
+    @wp.func
+    def light_pdf(
+        lights: LightTables, geometry: Geometry, light_index: int, p: wp.vec3, wi: wp.vec3, q: wp.vec3, normal: wp.vec3
+    ) -> float:
+        light = lights.lights[light_index]
+        pdf = float(0.0)
+        if wp.static(has_triangle):
+            if light.kind == KIND_TRIANGLE:
+                v0 = geometry.points[geometry.indices[3 * light.primitive]]
+                v1 = geometry.points[geometry.indices[3 * light.primitive + 1]]
+                v2 = geometry.points[geometry.indices[3 * light.primitive + 2]]
+                area2 = wp.length(wp.cross(v1 - v0, v2 - v0))
+                pdf = 2.0 * wp.length_sq(q - p) / (wp.abs(wp.dot(normal, wi)) * area2)
+        if wp.static(has_sphere):
+            if light.kind == KIND_SPHERE:
+                sphere = geometry.spheres[light.primitive - geometry.triangle_count]
+                one_minus_cos = sphere_cone(sphere, p)
+                if one_minus_cos > 0.0:
+                    pdf = cone_pdf(one_minus_cos)
+                else:
+                    pdf = sphere_pdf() * wp.length_sq(q - p)
+                    pdf /= wp.abs(wp.dot(normal, wi)) * sphere[3] * sphere[3]
+        if wp.static(has_constant):
+            if light.kind == KIND_CONSTANT:
+                pdf = sphere_pdf()
+        return light.pmf * pdf
+
+    return sample_light, light_pdf

@@ -1,0 +1,80 @@
+"""Finding records in a scene: by name, or all of them."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Iterator
+
+from wavefront.errors import SceneError
+from wavefront.scene import description
+
+# Fields in which a string is the name of a texture.
+TEXTURE_FIELDS = frozenset(
+    ("reflectance", "specular_reflectance", "specular_transmittance", "alpha", "opacity", "radiance", "eta", "k")
+)
+# Fields in which a string is the name of a BSDF.
+BSDF_FIELDS = frozenset(("bsdf", "front", "back"))
+# Long lists of numbers, in which there is no record to find.
+NUMBER_FIELDS = frozenset(("vertices", "faces", "normals", "uvs"))
+
+_DEFAULT_BSDF = description.Diffuse()
+
+
+def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:
+    """The message for a name that is not known: the nearest known one, then all of them."""
+    names = sorted(known)
+    close = difflib.get_close_matches(name, names, n=1)
+    hint = f"; did you mean {close[0]!r}?" if close else ";"
+    listed = f"known: {', '.join(map(shown, names))}" if names else "none is defined"
+    return f"unknown {kind} {shown(name)}{hint} {listed}"
+
+
+def shown(text: str) -> str:
+    """Text from a file as it is quoted in a message: on one line, printable, not too long."""
+    return repr(text if len(text) <= 60 else text[:57] + "...")
+
+
+def resolve_bsdf(scene: description.Scene, ref: str | description.Bsdf | None) -> description.Bsdf:
+    """The BSDF record that `ref` names, `ref` itself if it is a record, and the default for None.
+
+    The fields of a nested BSDF are left as they are: resolve them in turn.
+
+    Raises:
+        SceneError: No BSDF of the scene has that name.
+    """
+    if ref is None:
+        return _DEFAULT_BSDF
+    return _resolve("bsdf", scene.bsdfs, ref)
+
+
+def resolve_texture(scene: description.Scene, ref: object) -> object:
+    """The texture record that `ref` names; a number, a colour or a texture record is returned as it is.
+
+    Raises:
+        SceneError: No texture of the scene has that name.
+    """
+    return _resolve("texture", scene.textures, ref)
+
+
+def _resolve(kind, records, ref):
+    if not isinstance(ref, str):
+        return ref
+    for record in records:
+        if record.name == ref and ref:
+            return record
+    raise SceneError(unknown_name(kind, ref, (record.name for record in records if record.name)))
+
+
+def walk(record: description.Record, path: str = "") -> Iterator[tuple[str, description.Record]]:
+    """All records in `record`, itself first, in the order of the file, each with its path such as ``bsdfs[2]``."""
+    stack: list[tuple[str, object]] = [(path, record)]  # not recursive: a file may nest as deep as it likes
+    while stack:
+        path, item = stack.pop()
+        if isinstance(item, description.Record):
+            yield path, item
+            prefix = path + "." if path else ""
+            children = [(prefix + name, getattr(item, name)) for name in item.__struct_fields__
+                        if name not in NUMBER_FIELDS]
+        else:
+            children = [(f"{path}[{i}]", child) for i, child in enumerate(item)]
+        stack.extend(child for child in reversed(children) if isinstance(child[1], (description.Record, list)))

@@ -1,0 +1,280 @@
+"""What types cannot say: whether a scene's names, files, nesting and numbers make sense together."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from wavefront.errors import SceneError
+from wavefront.scene import description
+from wavefront.scene.lookup import BSDF_FIELDS, NUMBER_FIELDS, TEXTURE_FIELDS, shown, unknown_name, walk
+
+MESH_SUFFIXES = (".ply", ".obj", ".gltf", ".glb")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
+_STEP_KEYS = ("translate", "rotate", "scale", "look_at", "matrix")
+_REFLECTING = ("diffuse", "conductor", "rough_conductor")
+_LARGEST = float(np.finfo(np.float32).max)
+
+
+def validate(
+    scene: description.Scene, file: str | os.PathLike | None = None, warn: Callable[[str], object] | None = None
+) -> list[str]:
+    """Checks `scene` and returns warnings, each of which is also passed to `warn`.
+
+    Raises:
+        SceneError: The first thing found that makes the scene impossible to render, with its record path.
+    """
+    try:
+        _check_names(scene)
+        bsdfs = {bsdf.name: bsdf for bsdf in scene.bsdfs if bsdf.name}
+        textures = {texture.name for texture in scene.textures if texture.name}
+        for path, record in walk(scene):
+            _check_numbers(record, path)
+            _check_references(record, path, bsdfs, textures)
+            if isinstance(record, description.Bitmap):
+                _check_file(record.file, IMAGE_SUFFIXES, "image", f"{path}.file")
+            elif isinstance(record, (description.Conductor, description.RoughConductor)):
+                _check_conductor(record, path)
+            elif isinstance(record, (description.Dielectric, description.RoughDielectric)):
+                _check_dielectric(record, path)
+            elif isinstance(record, description.Mesh):
+                _check_mesh(record, path)
+            elif isinstance(record, (description.TwoSided, description.Mask)):
+                _check_nesting(record, path, bsdfs)
+        for i, shape in enumerate(scene.shapes):
+            matrix = _check_transform(shape.to_world, f"shapes[{i}].to_world")
+            if isinstance(shape, description.Sphere) and matrix is not None and not _is_similarity(matrix):
+                _fail(f"shapes[{i}].to_world", "a sphere can be scaled uniformly only; found different scales or a shear")
+        _check_transform(scene.camera.to_world, "camera.to_world")
+        if len(scene.emitters) > 1:
+            _fail("emitters[1]", f"a scene has at most one constant environment; found {len(scene.emitters)}")
+        for i, aov in enumerate(scene.film.aovs):
+            if aov in scene.film.aovs[:i]:
+                _fail(f"film.aovs[{i}]", f"{aov!r} is given twice")
+    except SceneError as error:
+        raise SceneError(error.message, file, error.path) from None
+    warnings = _find_warnings(scene)
+    for message in warnings if warn else ():
+        warn(message)
+    return warnings
+
+
+def _fail(path, message):
+    raise SceneError(message, None, path)
+
+
+def _find_warnings(scene):
+    warnings = []
+    if not scene.shapes:
+        warnings.append("the scene has no shapes")
+    if not scene.emitters and all(shape.emitter is None for shape in scene.shapes):
+        warnings.append("the scene has no emitter: the image will be black")
+    for kind in ("textures", "bsdfs"):
+        for i, record in enumerate(getattr(scene, kind)):
+            if not record.name:
+                warnings.append(f"{kind}[{i}] has no name, so nothing can refer to it")
+    return warnings
+
+
+# --- names and references --------------------------------------------------------------------------------------
+
+
+def _check_names(scene):
+    for kind in ("textures", "bsdfs", "emitters", "shapes"):
+        seen = set()
+        for i, record in enumerate(getattr(scene, kind)):
+            if record.name and record.name in seen:
+                _fail(f"{kind}[{i}].name", f"the name {shown(record.name)} is taken by an earlier entry of {kind}")
+            seen.add(record.name)
+
+
+def _check_references(record, path, bsdfs, textures):
+    for field in record.__struct_fields__:
+        value = getattr(record, field)
+        if isinstance(value, str):
+            if field in TEXTURE_FIELDS and value not in textures:
+                _fail(f"{path}.{field}", unknown_name("texture", value, textures))
+            if field in BSDF_FIELDS and value not in bsdfs:
+                _fail(f"{path}.{field}", unknown_name("BSDF", value, bsdfs))
+
+
+# --- BSDFs -----------------------------------------------------------------------------------------------------
+
+
+def _check_conductor(bsdf, path):
+    from wavefront.scene.ior import CONDUCTORS
+
+    given = [name for name in ("material", "eta", "k") if getattr(bsdf, name) is not None]
+    if given not in (["material"], ["eta", "k"]):
+        _fail(path, f"a conductor has material, or eta and k; found {' and '.join(given) if given else 'none of them'}")
+    if bsdf.material is not None and bsdf.material not in CONDUCTORS:
+        _fail(f"{path}.material", unknown_name("metal", bsdf.material, CONDUCTORS))
+
+
+def _check_dielectric(bsdf, path):
+    from wavefront.scene.ior import INDEX_OF_REFRACTION
+
+    for field in ("int_ior", "ext_ior"):
+        ior = getattr(bsdf, field)
+        if isinstance(ior, str) and ior not in INDEX_OF_REFRACTION:
+            _fail(f"{path}.{field}", unknown_name("index of refraction", ior, INDEX_OF_REFRACTION))
+
+
+def _check_nesting(bsdf, path, bsdfs):
+    """A two-sided BSDF holds reflecting ones; a mask holds anything but a mask. So nesting ends by itself."""
+    for field in ("front", "back") if isinstance(bsdf, description.TwoSided) else ("bsdf",):
+        inner = getattr(bsdf, field)
+        if isinstance(inner, str):
+            _check_cycle(inner, f"{path}.{field}", bsdfs)
+            inner = bsdfs.get(inner)  # an unknown name is reported where the reference is checked
+        if inner is None:
+            continue
+        kind = inner.__struct_config__.tag
+        if isinstance(bsdf, description.TwoSided) and kind not in _REFLECTING:
+            _fail(f"{path}.{field}", f"a twosided BSDF cannot hold {kind}; allowed: {', '.join(_REFLECTING)}")
+        if isinstance(bsdf, description.Mask) and kind == "mask":
+            _fail(f"{path}.{field}", "a mask cannot hold another mask; multiply their opacities")
+
+
+def _check_cycle(name, path, bsdfs):
+    """Follows the references that start with `name`; a name that leads back to itself is refused."""
+    open_names, stack = [], [(name, 0)]
+    while stack:
+        name, depth = stack.pop()
+        del open_names[depth:]
+        if name in open_names:
+            chain = [*open_names[open_names.index(name) :], name]
+            _fail(path, f"BSDFs refer to each other in a cycle: {' -> '.join(map(shown, chain))}")
+        open_names.append(name)
+        for _, record in walk(bsdfs[name]) if name in bsdfs else ():
+            for field in BSDF_FIELDS.intersection(record.__struct_fields__):
+                if isinstance(getattr(record, field), str):
+                    stack.append((getattr(record, field), depth + 1))
+
+
+# --- shapes ----------------------------------------------------------------------------------------------------
+
+
+def _check_file(file, suffixes, kind, path):
+    suffix = Path(file).suffix.lower()
+    if suffix not in suffixes:
+        _fail(path, f"unknown {kind} format {shown(suffix)} of {shown(file)}; allowed: {', '.join(suffixes)}")
+    if not os.path.isfile(file):
+        _fail(path, f"file not found: {shown(file)}")
+
+
+def _check_mesh(mesh, path):
+    inline = [name for name in ("vertices", "faces", "normals", "uvs") if getattr(mesh, name) is not None]
+    if mesh.file is not None:
+        if inline:
+            _fail(path, f"a mesh with a file has no {inline[0]} of its own")
+        _check_file(mesh.file, MESH_SUFFIXES, "mesh", f"{path}.file")
+        return
+    if "vertices" not in inline or "faces" not in inline:
+        _fail(path, f"a mesh has file, or vertices and faces; found {' and '.join(inline) if inline else 'none of them'}")
+    for name in ("vertices", "faces"):
+        if len(getattr(mesh, name)) == 0:
+            _fail(f"{path}.{name}", "the mesh is empty")
+    count = len(mesh.vertices)
+    for name in ("normals", "uvs"):
+        if name in inline and len(getattr(mesh, name)) != count:
+            _fail(f"{path}.{name}", f"expected one per vertex, {count}; found {len(getattr(mesh, name))}")
+    try:
+        faces = np.asarray(mesh.faces, dtype=np.int64)
+        wrong = (faces < 0) | (faces >= count)
+    except OverflowError:  # an index of more than 64 bits
+        wrong = np.array([[not 0 <= index < count for index in face] for face in mesh.faces])
+    if wrong.any():
+        row, column = np.argwhere(wrong)[0]
+        found = shown(str(mesh.faces[row][column]))[1:-1]
+        _fail(f"{path}.faces[{row}]", f"expected vertex indices from 0 to {count - 1}; found {found}")
+
+
+# --- numbers and transforms ------------------------------------------------------------------------------------
+
+
+def _check_numbers(record, path):
+    for field in record.__struct_fields__:
+        value = getattr(record, field)
+        place = f"{path}.{field}" if path else field
+        if isinstance(value, (float, int)) or (isinstance(value, (tuple, list)) and field not in NUMBER_FIELDS):
+            _check_value(value, place)
+        elif field in NUMBER_FIELDS and field != "faces" and value is not None and len(value):
+            table = np.asarray(value, dtype=np.float64)
+            wrong = ~(np.abs(table) <= _LARGEST)
+            if wrong.any():
+                row, column = np.argwhere(wrong)[0]
+                _check_value(float(table[row, column]), f"{place}[{row}]")
+
+
+def _check_value(value, place):
+    if isinstance(value, (tuple, list)):
+        for i, item in enumerate(value):
+            _check_value(item, f"{place}[{i}]")
+    elif isinstance(value, float) and not abs(value) <= _LARGEST:
+        if np.isfinite(value):
+            _fail(place, f"expected a number of at most {_LARGEST:.4g}, as 32-bit floats are; found {value:g}")
+        _fail(place, f"expected a finite number; found {value}")
+
+
+def _check_transform(transform, path):
+    """The matrix of a transform that was found to be well-formed and invertible; None where there is none."""
+    from wavefront.scene.transforms import to_matrix
+
+    if not transform:
+        return None
+    rows = [not isinstance(step, description.TransformStep) for step in transform]
+    if any(rows) and not all(rows):
+        _fail(path, "rows of a matrix and steps cannot be mixed")
+    if all(rows):
+        if len(rows) != 4:
+            _fail(path, f"a matrix has 4 rows; found {len(rows)}")
+        _check_last_row(transform[3], f"{path}[3]")
+    else:
+        for i, step in enumerate(transform):
+            _check_step(step, f"{path}[{i}]")
+    with np.errstate(over="ignore", invalid="ignore"):
+        matrix = np.asarray(to_matrix(transform), dtype=np.float64)
+    if not np.all(np.abs(matrix) <= _LARGEST):
+        _fail(path, "the numbers of the transform's matrix are too large")
+    values = np.linalg.svd(matrix[:3, :3], compute_uv=False)
+    if not values[2] > 1e-12 * values[0]:
+        _fail(path, "the transform cannot be inverted: it flattens what it is applied to")
+    return matrix
+
+
+def _check_last_row(row, path):
+    if tuple(row) != (0.0, 0.0, 0.0, 1.0):
+        _fail(path, f"the last row of a matrix is [0, 0, 0, 1]; found {list(row)}")
+
+
+def _check_step(step, path):
+    keys = [key for key in _STEP_KEYS if getattr(step, key) is not None]
+    if len(keys) != 1:
+        found = " and ".join(keys) if keys else "none of them"
+        _fail(path, f"a step has exactly one of {', '.join(_STEP_KEYS)}; found {found}")
+    if step.matrix is not None:
+        _check_last_row(step.matrix[3], f"{path}.matrix[3]")
+    elif step.scale is not None and not np.all(step.scale):
+        _fail(f"{path}.scale", "a scale of 0 cannot be inverted")
+    elif step.rotate is not None and not any(step.rotate.axis):
+        _fail(f"{path}.rotate.axis", "the axis has no direction; found [0, 0, 0]")
+    elif step.look_at is not None:
+        look_at = step.look_at
+        forward = np.subtract(look_at.target, look_at.origin)
+        if not forward.any():
+            _fail(f"{path}.look_at.target", f"target is the same point as origin; found {list(look_at.target)}")
+        if not any(look_at.up):
+            _fail(f"{path}.look_at.up", "up has no direction; found [0, 0, 0]")
+        sine = np.linalg.norm(np.cross(forward / np.abs(forward).max(), look_at.up / np.abs(look_at.up).max()))
+        if sine < 1e-6:
+            _fail(f"{path}.look_at.up", f"up is parallel to the direction of view; found {list(look_at.up)}")
+
+
+def _is_similarity(matrix):
+    """Whether the matrix scales all directions alike, up to float32 rounding."""
+    values = np.linalg.svd(matrix[:3, :3], compute_uv=False)
+    return values[0] - values[2] <= 1e-4 * values[0]

@@ -1,0 +1,46 @@
+"""Accumulate: adds the samples of each pixel of the tile to the film, in the order of the samples."""
+
+from __future__ import annotations
+
+import functools
+
+import warp as wp
+
+from wavefront.film import FilmArrays, luminance
+from wavefront.queues import SAMPLE_COUNT, TILE_HEIGHT, TILE_WIDTH, TILE_X, TILE_Y, Paths
+
+
+@functools.cache
+def make_accumulate(variance: bool):
+    """Kernel of the stage, one thread per pixel; `variance`: also sum the squares of the luminance."""
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def accumulate_samples(
+        paths: Paths,
+        tile: wp.array[wp.int32],
+        film_width: int,
+        # out
+        film: FilmArrays,
+    ):
+        local = wp.tid()
+        if local >= tile[TILE_WIDTH] * tile[TILE_HEIGHT]:
+            return
+        samples = tile[SAMPLE_COUNT]
+        x = tile[TILE_X] + local % tile[TILE_WIDTH]
+        y = tile[TILE_Y] + local // tile[TILE_WIDTH]
+        pixel = y * film_width + x
+        total = film.L[pixel]
+        square = wp.float64(0.0)
+        if wp.static(variance):
+            square = film.luminance_squared[pixel]
+        for s in range(samples):
+            L = paths.L[local * samples + s]
+            total += wp.vec3d(wp.float64(L[0]), wp.float64(L[1]), wp.float64(L[2]))
+            if wp.static(variance):
+                y_sample = wp.float64(luminance(L))
+                square += y_sample * y_sample
+        film.L[pixel] = total
+        if wp.static(variance):
+            film.luminance_squared[pixel] = square
+
+    return accumulate_samples

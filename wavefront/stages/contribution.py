@@ -1,0 +1,14 @@
+"""Adding radiance to a path, with the account of what is left out."""
+
+import warp as wp
+
+from wavefront.queues import Paths
+
+
+@wp.func
+def add_radiance(paths: Paths, slot: int, L: wp.vec3, counters: wp.array[wp.int32], nonfinite_counter: int):
+    """Adds `L` to the path's radiance; a non-finite or negative contribution is counted and left out."""
+    if wp.isfinite(L) and wp.min(L) >= 0.0:
+        paths.L[slot] += L
+    else:
+        wp.atomic_add(counters, nonfinite_counter, 1)

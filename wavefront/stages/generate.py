@@ -1,0 +1,92 @@
+"""Generate camera rays: reads the tile and the camera, fills every slot and queues it."""
+
+from __future__ import annotations
+
+import functools
+
+import warp as wp
+
+from wavefront.camera import Camera, camera_ray
+from wavefront.queues import (
+    CONTINUE,
+    DEPTH,
+    EMISSIVE,
+    ESCAPED,
+    FIRST_SAMPLE,
+    HITS,
+    RAYS,
+    SAMPLE_COUNT,
+    SHADOW,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    TILE_X,
+    TILE_Y,
+    TOTAL_PATHS,
+    Paths,
+    Queue,
+)
+from wavefront.rng import PURPOSE_CAMERA, uniform4
+from wavefront.warp_samples import square_to_gaussian, square_to_tent
+
+
+@functools.cache
+def make_generate(filter_kind: str, transmission: bool):
+    """Kernel of the stage.
+
+    Args:
+        filter_kind: Reconstruction filter, ``box``, ``tent`` or ``gaussian``, sampled so that each sample counts for
+            its own pixel alone (Ernst, Stamminger and Greiner 2006, "Filter Importance Sampling").
+        transmission: Whether paths track the index of refraction.
+    """
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def generate_rays(
+        camera: Camera,
+        tile: wp.array[wp.int32],
+        film_width: int,
+        filter_scale: float,
+        seed: wp.uint64,
+        # out
+        paths: Paths,
+        rays: Queue,
+        counters: wp.array[wp.int32],
+        totals: wp.array[wp.int64],
+    ):
+        slot = wp.tid()
+        samples = tile[SAMPLE_COUNT]
+        count = tile[TILE_WIDTH] * tile[TILE_HEIGHT] * samples
+        if slot >= count:
+            return
+        if slot == 0:
+            counters[RAYS] = count
+            counters[HITS] = 0
+            counters[ESCAPED] = 0
+            counters[EMISSIVE] = 0
+            counters[SHADOW] = 0
+            counters[DEPTH] = 0
+            counters[CONTINUE] = 1
+            totals[TOTAL_PATHS] += wp.int64(count)
+        local = slot // samples
+        x = tile[TILE_X] + local % tile[TILE_WIDTH]
+        y = tile[TILE_Y] + local // tile[TILE_WIDTH]
+        pixel = wp.uint32(y) * wp.uint32(film_width) + wp.uint32(x)
+        sample = wp.uint32(tile[FIRST_SAMPLE] + slot % samples)
+        u = uniform4(seed, pixel, sample, 0, PURPOSE_CAMERA)
+        square = wp.vec2(u[0], u[1])
+        offset = wp.vec2(u[0] - 0.5, u[1] - 0.5)
+        if wp.static(filter_kind == "tent"):
+            offset = filter_scale * square_to_tent(square)
+        if wp.static(filter_kind == "gaussian"):
+            offset = filter_scale * square_to_gaussian(square)
+        paths.origin[slot] = camera.origin
+        paths.direction[slot] = camera_ray(camera, float(x) + 0.5 + offset[0], float(y) + 0.5 + offset[1])
+        paths.beta[slot] = wp.vec3(1.0)
+        paths.L[slot] = wp.vec3(0.0)
+        paths.pdf[slot] = 0.0
+        paths.pixel[slot] = pixel
+        paths.sample[slot] = sample
+        if wp.static(transmission):
+            paths.eta[slot] = 1.0
+        rays.slots[slot] = slot
+
+    return generate_rays

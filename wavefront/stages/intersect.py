@@ -1,0 +1,64 @@
+"""Closest hit: reads queued rays, writes the vertex they reach and sorts the slots by what has to be done there."""
+
+from __future__ import annotations
+
+import functools
+
+import warp as wp
+
+from wavefront.accel.mesh_query import Geometry, make_intersector
+from wavefront.queues import DEPTH, Paths, Queue, Surfaces, push, queue_size
+from wavefront.surface import make_vertex
+
+
+@functools.cache
+def make_intersect(triangles: bool, spheres: bool, smooth: bool, uvs: bool, area_lights: bool, environment: bool):
+    """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
+    closest_hit, _ = make_intersector(triangles, spheres)
+    vertex_of = make_vertex(triangles, spheres, smooth, uvs)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def closest_hits(
+        geometry: Geometry,
+        paths: Paths,
+        rays: Queue,
+        max_depth: int,
+        # out
+        surfaces: Surfaces,
+        hits: Queue,
+        escaped: Queue,
+        emissive: Queue,
+        counters: wp.array[wp.int32],
+    ):
+        i = wp.tid()
+        if i >= queue_size(rays):
+            return
+        slot = rays.slots[i]
+        origin = paths.origin[slot]
+        direction = paths.direction[slot]
+        hit = closest_hit(geometry, origin, direction)
+        if hit.primitive < 0:
+            surfaces.material[slot] = -1
+            if wp.static(environment):
+                push(escaped, slot, counters)
+            return
+        vertex = vertex_of(geometry, origin, direction, hit)
+        shape = geometry.shapes[geometry.shape_of[hit.primitive]]
+        surfaces.position[slot] = vertex.position
+        surfaces.geometric_normal[slot] = vertex.geometric_normal
+        surfaces.shading_normal[slot] = vertex.shading_normal
+        surfaces.offset[slot] = vertex.offset
+        surfaces.material[slot] = shape.material
+        if wp.static(uvs):
+            surfaces.uv[slot] = vertex.uv
+        if wp.static(area_lights):
+            light = int(-1)
+            if shape.first_light >= 0 and wp.dot(vertex.geometric_normal, direction) < 0.0:
+                light = shape.first_light + hit.primitive - shape.first_primitive
+                push(emissive, slot, counters)
+            surfaces.light[slot] = light
+        # At the last vertex of the longest path only its emission counts.
+        if counters[DEPTH] + 1 < max_depth:
+            push(hits, slot, counters)
+
+    return closest_hits

@@ -1,0 +1,92 @@
+"""Scatter: samples the BSDF, updates the throughput, plays Russian roulette and queues the next ray."""
+
+from __future__ import annotations
+
+import functools
+
+import warp as wp
+
+from wavefront.bsdf.dispatch import make_bsdf
+from wavefront.bsdf.tables import MaterialTables
+from wavefront.queues import DEPTH, NONFINITE_SCATTER, Paths, Queue, Surfaces, push, queue_size
+from wavefront.rng import PURPOSE_BSDF, uniform4
+from wavefront.surface import spawn_origin
+from wavefront.texture import TextureTables
+
+
+@wp.func
+def survival_probability(beta: wp.vec3, eta: float) -> float:
+    """Of Russian roulette: the largest channel of the throughput, without the scaling of radiance in a medium of index
+    `eta`, which is undone when the path leaves it. Never certain, so that a path between mirrors ends."""
+    return wp.min(wp.max(beta) * eta * eta, 0.95)
+
+
+@functools.cache
+def make_scatter(
+    bsdfs: tuple[str, ...], mask: bool, textures: tuple[str, ...], uvs: bool, transmission: bool, roulette: bool
+):
+    """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
+    _, sample_bsdf, _ = make_bsdf(bsdfs, mask, textures)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def scatter_paths(
+        materials: MaterialTables,
+        textures: TextureTables,
+        surfaces: Surfaces,
+        hits: Queue,
+        rr_depth: int,
+        seed: wp.uint64,
+        # in and out
+        paths: Paths,
+        # out
+        rays: Queue,
+        counters: wp.array[wp.int32],
+    ):
+        i = wp.tid()
+        if i >= queue_size(hits):
+            return
+        slot = hits.slots[i]
+        depth = counters[DEPTH]
+
+        # propose
+        u = uniform4(seed, paths.pixel[slot], paths.sample[slot], depth, PURPOSE_BSDF)
+        uv = wp.vec2(0.0)
+        if wp.static(uvs):
+            uv = surfaces.uv[slot]
+        bsdf = sample_bsdf(
+            materials,
+            textures,
+            surfaces.material[slot],
+            uv,
+            surfaces.shading_normal[slot],
+            -paths.direction[slot],
+            wp.vec3(u[0], u[1], u[2]),
+        )
+
+        # resolve
+        beta = wp.cw_mul(paths.beta[slot], bsdf.weight)
+        if not (wp.isfinite(beta) and wp.isfinite(bsdf.wi) and wp.isfinite(bsdf.pdf) and wp.min(beta) >= 0.0):
+            wp.atomic_add(counters, NONFINITE_SCATTER, 1)
+            return
+        if wp.max(beta) == 0.0:
+            return
+        eta = float(1.0)
+        if wp.static(transmission):
+            eta = paths.eta[slot] * bsdf.eta
+            paths.eta[slot] = eta
+        if wp.static(roulette):
+            if depth + 1 >= rr_depth:
+                survival = survival_probability(beta, eta)
+                if u[3] >= survival:
+                    return
+                beta /= survival
+        wi = wp.normalize(bsdf.wi)
+        paths.beta[slot] = beta
+        paths.direction[slot] = wi
+        paths.pdf[slot] = bsdf.pdf
+        paths.origin[slot] = spawn_origin(
+            surfaces.position[slot], surfaces.geometric_normal[slot], surfaces.offset[slot], wi
+        )
+        push(rays, slot, counters)
+
+    return scatter_paths

@@ -1,0 +1,104 @@
+"""From a hit to the vertex of a path: position, normals, UV, and how far a new ray must start from it."""
+
+from __future__ import annotations
+
+import functools
+
+import warp as wp
+
+from wavefront.accel.mesh_query import Geometry, Hit
+
+# Bound on the relative error of an interpolated position and of a ray-triangle test against its own triangle, in
+# units of float32's 2^-24: a handful of roundings (Higham 2002, section 3.1), doubled to be safe.
+POSITION_ERROR = wp.constant(32.0 * 5.9604645e-8)
+
+
+@wp.struct
+class Vertex:
+    position: wp.vec3
+    geometric_normal: wp.vec3
+    shading_normal: wp.vec3
+    offset: wp.float32
+    uv: wp.vec2
+
+
+@wp.func
+def position_error(v0: wp.vec3, v1: wp.vec3, v2: wp.vec3, b0: float, b1: float, normal: wp.vec3) -> float:
+    """Bound on the rounding error of b0 v0 + b1 v1 + b2 v2 along the normal, in metres.
+
+    It follows the size of the coordinates that enter, so it is right for a scene of any scale and needs no epsilon
+    of the scene (Waechter and Binder 2019; Pharr, Jakob and Humphreys 2023, section 6.8).
+    """
+    b2 = wp.abs(1.0 - b0 - b1)
+    magnitude = b0 * wp.abs(v0) + b1 * wp.abs(v1) + b2 * wp.abs(v2)
+    return POSITION_ERROR * wp.dot(magnitude, wp.abs(normal))
+
+
+@wp.func
+def spawn_origin(position: wp.vec3, geometric_normal: wp.vec3, offset: float, direction: wp.vec3) -> wp.vec3:
+    """Origin of a ray that leaves a surface in `direction`, moved off the surface to the side it leaves to."""
+    return position + wp.where(wp.dot(geometric_normal, direction) < 0.0, -offset, offset) * geometric_normal
+
+
+@wp.func
+def sphere_uv(normal: wp.vec3) -> wp.vec2:
+    """u: longitude from +X towards +Y, v: colatitude from +Z, both scaled to [0, 1]."""
+    u = wp.atan2(normal[1], normal[0]) / wp.static(2.0 * wp.pi)
+    return wp.vec2(wp.where(u < 0.0, u + 1.0, u), wp.acos(wp.clamp(normal[2], -1.0, 1.0)) / wp.pi)
+
+
+@functools.cache
+def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
+    """`make_vertex(geometry, origin, direction, hit) -> Vertex` for a hit that exists.
+
+    Args:
+        triangles: The scene has triangles.
+        spheres: The scene has spheres.
+        smooth: Some mesh has vertex normals.
+        uvs: Some texture is looked up.
+    """
+
+    @wp.func
+    def vertex_of(geometry: Geometry, origin: wp.vec3, direction: wp.vec3, hit: Hit) -> Vertex:
+        vertex = Vertex()
+        if wp.static(triangles):
+            if hit.primitive < geometry.triangle_count:
+                i0 = geometry.indices[3 * hit.primitive]
+                i1 = geometry.indices[3 * hit.primitive + 1]
+                i2 = geometry.indices[3 * hit.primitive + 2]
+                v0 = geometry.points[i0]
+                v1 = geometry.points[i1]
+                v2 = geometry.points[i2]
+                b2 = 1.0 - hit.u - hit.v
+                vertex.position = hit.u * v0 + hit.v * v1 + b2 * v2
+                normal = wp.normalize(wp.cross(v1 - v0, v2 - v0))
+                vertex.shading_normal = normal
+                if wp.static(smooth):
+                    if geometry.shapes[geometry.shape_of[hit.primitive]].smooth == 1:
+                        blend = hit.u * geometry.normals[i0] + hit.v * geometry.normals[i1] + b2 * geometry.normals[i2]
+                        if wp.length_sq(blend) > 0.0:
+                            vertex.shading_normal = wp.normalize(blend)
+                            if wp.dot(vertex.shading_normal, normal) < 0.0:
+                                normal = -normal
+                vertex.geometric_normal = normal
+                vertex.offset = position_error(v0, v1, v2, hit.u, hit.v, normal)
+                if wp.static(uvs):
+                    vertex.uv = hit.u * geometry.uvs[i0] + hit.v * geometry.uvs[i1] + b2 * geometry.uvs[i2]
+        if wp.static(spheres):
+            if hit.primitive >= geometry.triangle_count:
+                index = hit.primitive - geometry.triangle_count
+                sphere = geometry.spheres[index]
+                center = wp.vec3(sphere[0], sphere[1], sphere[2])
+                outwards = wp.normalize(origin + hit.t * direction - center)
+                vertex.position = center + sphere[3] * outwards
+                vertex.geometric_normal = outwards
+                if geometry.shapes[geometry.shape_of[hit.primitive]].flip == 1:
+                    vertex.geometric_normal = -outwards
+                vertex.shading_normal = vertex.geometric_normal
+                # The intersection itself loses digits of |origin - centre|, but the point was put back onto the sphere.
+                vertex.offset = POSITION_ERROR * (wp.dot(wp.abs(center), wp.abs(outwards)) + sphere[3])
+                if wp.static(uvs):
+                    vertex.uv = sphere_uv(geometry.sphere_to_local[index] * outwards)
+        return vertex
+
+    return vertex_of

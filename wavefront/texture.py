@@ -1,0 +1,162 @@
+"""Textures: bitmaps in their file's own precision, and checkerboards.
+
+All pixels of 8-bit bitmaps lie in one byte array and all pixels of float bitmaps in one float array; a record says
+where a texture starts and how to read it. (u, v) = (0, 0) is the upper left corner of the image.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import warp as wp
+
+KIND_CHECKERBOARD = wp.constant(0)
+KIND_BYTES = wp.constant(1)
+KIND_FLOATS = wp.constant(2)
+
+WRAP_REPEAT = wp.constant(0)
+WRAP_MIRROR = wp.constant(1)
+WRAP_CLAMP = wp.constant(2)
+WRAP_MODES = {"repeat": 0, "mirror": 1, "clamp": 2}
+
+
+@wp.struct
+class TextureRecord:
+    kind: wp.int32
+    first: wp.int64  # index of the first value in the byte or float array
+    width: wp.int32
+    height: wp.int32
+    channels: wp.int32  # 1 or 3
+    srgb: wp.int32  # 1 if bytes are sRGB-encoded
+    nearest: wp.int32  # 1: no interpolation
+    wrap: wp.int32
+    uv_row0: wp.vec3
+    uv_row1: wp.vec3
+    color0: wp.vec3  # of a checkerboard
+    color1: wp.vec3
+
+
+@wp.struct
+class TextureTables:
+    records: wp.array[TextureRecord]
+    bytes: wp.array[wp.uint8]
+    floats: wp.array[wp.float32]
+    srgb_to_linear: wp.array[wp.float32]  # 256 entries
+
+
+def srgb_to_linear(value: np.ndarray) -> np.ndarray:
+    """Inverse of the sRGB transfer function (IEC 61966-2-1), values in [0, 1]."""
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+@wp.func
+def wrap_coordinate(i: int, size: int, mode: int) -> int:
+    """Index of the pixel that coordinate `i` falls on; `i` may be any integer."""
+    if mode == WRAP_CLAMP:
+        return wp.clamp(i, 0, size - 1)
+    if mode == WRAP_MIRROR:
+        period = 2 * size
+        m = i % period
+        if m < 0:
+            m += period
+        return wp.where(m < size, m, period - 1 - m)
+    m = i % size
+    return wp.where(m < 0, m + size, m)
+
+
+@functools.cache
+def make_eval_texture(kinds: tuple[str, ...]):
+    """`eval_texture(tables, texture, uv) -> vec3` for the kinds of texture in a scene.
+
+    Args:
+        kinds: Subset of ``("bytes", "checkerboard", "floats")``.
+    """
+    has_bytes = "bytes" in kinds
+    has_floats = "floats" in kinds
+    has_checkerboard = "checkerboard" in kinds
+
+    @wp.func
+    def fetch(tables: TextureTables, record: TextureRecord, x: int, y: int) -> wp.vec3:
+        pixel = wrap_coordinate(y, record.height, record.wrap) * record.width
+        pixel += wrap_coordinate(x, record.width, record.wrap)
+        i = record.first + wp.int64(pixel) * wp.int64(record.channels)
+        rgb = wp.vec3(0.0)
+        if wp.static(has_bytes):
+            if record.kind == KIND_BYTES:
+                r = wp.int32(tables.bytes[i])
+                g = r
+                b = r
+                if record.channels == 3:
+                    g = wp.int32(tables.bytes[i + wp.int64(1)])
+                    b = wp.int32(tables.bytes[i + wp.int64(2)])
+                if record.srgb == 1:
+                    rgb = wp.vec3(tables.srgb_to_linear[r], tables.srgb_to_linear[g], tables.srgb_to_linear[b])
+                else:
+                    rgb = wp.vec3(float(r), float(g), float(b)) / 255.0
+        if wp.static(has_floats):
+            if record.kind == KIND_FLOATS:
+                grey = tables.floats[i]
+                rgb = wp.vec3(grey)
+                if record.channels == 3:
+                    rgb = wp.vec3(grey, tables.floats[i + wp.int64(1)], tables.floats[i + wp.int64(2)])
+        return rgb
+
+    @wp.func
+    def eval_texture(tables: TextureTables, texture: int, surface_uv: wp.vec2) -> wp.vec3:
+        record = tables.records[texture]
+        uv1 = wp.vec3(surface_uv[0], surface_uv[1], 1.0)
+        u = wp.dot(record.uv_row0, uv1)
+        v = wp.dot(record.uv_row1, uv1)
+        if not wp.isfinite(u + v):
+            return wp.vec3(0.0)
+        if wp.static(has_checkerboard):
+            if record.kind == KIND_CHECKERBOARD:
+                in_left = u - wp.floor(u) < 0.5
+                in_top = v - wp.floor(v) < 0.5
+                return wp.where(in_left == in_top, record.color0, record.color1)
+        if wp.static(has_bytes or has_floats):
+            # Whole periods of the largest wrap mode are taken off first, so that the product with the size is exact
+            # enough and fits an int however far the coordinate is.
+            if record.wrap == WRAP_CLAMP:
+                u = wp.clamp(u, -1.0, 2.0)
+                v = wp.clamp(v, -1.0, 2.0)
+            else:
+                u -= 2.0 * wp.floor(0.5 * u)
+                v -= 2.0 * wp.floor(0.5 * v)
+            x = u * float(record.width)
+            y = v * float(record.height)
+            if record.nearest == 1:
+                return fetch(tables, record, int(wp.floor(x)), int(wp.floor(y)))
+            x -= 0.5  # pixel centres are at half-integers
+            y -= 0.5
+            x0 = int(wp.floor(x))
+            y0 = int(wp.floor(y))
+            fx = x - wp.floor(x)
+            fy = y - wp.floor(y)
+            top = (1.0 - fx) * fetch(tables, record, x0, y0) + fx * fetch(tables, record, x0 + 1, y0)
+            bottom = (1.0 - fx) * fetch(tables, record, x0, y0 + 1) + fx * fetch(tables, record, x0 + 1, y0 + 1)
+            return (1.0 - fy) * top + fy * bottom
+        return wp.vec3(0.0)
+
+    @wp.func
+    def no_texture(tables: TextureTables, texture: int, surface_uv: wp.vec2) -> wp.vec3:
+        return wp.vec3(1.0)
+
+    return eval_texture if kinds else no_texture
+
+
+@functools.cache
+def make_eval_parameter(kinds: tuple[str, ...]):
+    """`eval_parameter(tables, value, texture, uv) -> vec3`: the value, or the texture's where `texture` is not -1."""
+    textured = bool(kinds)
+    eval_texture = make_eval_texture(kinds)
+
+    @wp.func
+    def eval_parameter(tables: TextureTables, value: wp.vec3, texture: int, uv: wp.vec2) -> wp.vec3:
+        if wp.static(textured):
+            if texture >= 0:
+                return eval_texture(tables, texture, uv)
+        return value
+
+    return eval_parameter
