@@ -37,11 +37,8 @@ def place(scale=None, rotate: tuple[str, float] | None = None, translate=None) -
 
 
 def rectangle(name: str, middle: tuple, facing: str, half_size: tuple[float, float], **fields) -> Rectangle:
-    """A rectangle that faces along an axis. Its half size is along x then y, or z where one of them is `facing`."""
-    along_y = facing[1] == "y"
-    size = (half_size[0], half_size[1], 1.0)  # local x and y; facing +-x, local x lies along z
-    assert along_y or facing[1] in "xz"
-    return Rectangle(name=name, to_world=place(size, _FACING[facing], middle), **fields)
+    """A rectangle that faces along an axis. `half_size` is along x (z if it faces along x) and y (z if along y)."""
+    return Rectangle(name=name, to_world=place((*half_size, 1.0), _FACING[facing], middle), **fields)
 
 
 def box(name: str, middle: tuple, half_size: tuple, turn: float | None = None, **fields) -> Cube:

@@ -1,0 +1,337 @@
+"""The bounce loop and the passes that cover the film.
+
+A pass adds some samples to every pixel. It is cut into tiles, each of which fills the slots of one worker. On the CPU
+device several workers take tiles from a shared list, each on its own thread with its own path state; on CUDA there is
+one worker, and its whole pass is one captured graph. An image does not depend on any of this: random numbers belong
+to (seed, pixel, sample, bounce, purpose) and the film adds the samples of a pixel in their order.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+import warp as wp
+
+from wavefront import queues
+from wavefront.camera import make_camera
+from wavefront.errors import WavefrontError
+from wavefront.features import Features
+from wavefront.film import Film
+from wavefront.queues import Paths, QueueSet, ShadowRays, Surfaces, allocate_struct, bytes_per_slot
+from wavefront.scene import description
+from wavefront.scene.device import DeviceScene
+from wavefront.stages.accumulate import make_accumulate
+from wavefront.stages.advance import advance_bounce, drain_rays
+from wavefront.stages.aov import make_aov
+from wavefront.stages.direct import make_direct
+from wavefront.stages.emission import make_emission
+from wavefront.stages.escaped import make_escaped
+from wavefront.stages.generate import make_generate
+from wavefront.stages.intersect import make_intersect
+from wavefront.stages.scatter import make_scatter
+from wavefront.stages.shadow import make_shadow
+
+FILTER_SCALES = {"box": lambda f: 0.5, "tent": lambda f: f.radius, "gaussian": lambda f: f.stddev}
+
+
+def filter_kind(film: description.Film) -> str:
+    return type(film.filter).__struct_config__.tag
+
+
+def make_features(scene: description.Scene, device_scene: DeviceScene) -> Features:
+    """What the kernels for a scene and its settings must do, and no more."""
+    integrator = scene.integrator
+    return Features(
+        triangles=device_scene.triangle_count > 0,
+        spheres=device_scene.sphere_count > 0,
+        smooth=device_scene.smooth,
+        uvs=bool(device_scene.texture_kinds),
+        bsdfs=device_scene.bsdfs,
+        mask=device_scene.mask,
+        textures=device_scene.texture_kinds,
+        lights=device_scene.light_kinds,
+        light_textures=device_scene.light_texture_kinds,
+        nee=integrator.nee,
+        roulette=integrator.rr_depth is not None and integrator.rr_depth < integrator.max_depth,
+        filter=filter_kind(scene.film),
+        aovs=tuple(sorted(set(scene.film.aovs) - {"variance"})),
+        variance="variance" in scene.film.aovs,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Kernels:
+    """The kernels of all stages; None where the scene needs no such stage."""
+
+    generate: wp.Kernel
+    intersect: wp.Kernel
+    escaped: wp.Kernel | None
+    emission: wp.Kernel | None
+    aov: wp.Kernel | None
+    direct: wp.Kernel | None
+    shadow: wp.Kernel | None
+    drain: wp.Kernel
+    scatter: wp.Kernel
+    advance: wp.Kernel
+    accumulate: wp.Kernel
+
+    def modules(self) -> list:
+        kernels = (getattr(self, field.name) for field in dataclasses.fields(self))
+        return list({kernel.module: None for kernel in kernels if kernel is not None})
+
+
+def make_kernels(f: Features) -> Kernels:
+    """Kernels for a set of features; scenes that agree in what a stage reads share its kernel."""
+    return Kernels(
+        generate=make_generate(f.filter, f.transmission),
+        intersect=make_intersect(f.triangles, f.spheres, f.smooth, f.uvs, f.area_lights, f.environment),
+        escaped=make_escaped(f.light_sampling) if f.environment else None,
+        emission=make_emission(f.lights, f.light_textures, f.light_sampling) if f.area_lights else None,
+        aov=make_aov(f.aovs, f.bsdfs, f.mask, f.textures, f.uvs) if f.aovs else None,
+        direct=make_direct(f.bsdfs, f.mask, f.textures, f.lights, f.light_textures, f.uvs)
+        if f.light_sampling
+        else None,
+        shadow=make_shadow(f.triangles, f.spheres) if f.light_sampling else None,
+        drain=drain_rays,
+        scatter=make_scatter(f.bsdfs, f.mask, f.textures, f.uvs, f.transmission, f.roulette),
+        advance=advance_bounce,
+        accumulate=make_accumulate(f.variance),
+    )
+
+
+def skipped_arrays(f: Features) -> dict[type, tuple[str, ...]]:
+    """Arrays of the path state that the features do without."""
+    return {
+        Paths: () if f.transmission else ("eta",),
+        Surfaces: (() if f.uvs else ("uv",)) + (() if f.area_lights else ("light",)),
+        ShadowRays: () if f.light_sampling else tuple(ShadowRays.vars),
+    }
+
+
+def queue_names(f: Features) -> tuple[str, ...]:
+    """Queues that the features need."""
+    needed = {"escaped": f.environment, "emissive": f.area_lights, "shadow": f.light_sampling}
+    return ("rays", "hits", *(name for name, used in needed.items() if used))
+
+
+def state_bytes_per_slot(f: Features) -> int:
+    """Memory of one path in flight."""
+    structs = sum(bytes_per_slot(struct, skip) for struct, skip in skipped_arrays(f).items())
+    return structs + 4 * len(queue_names(f))
+
+
+@dataclasses.dataclass(frozen=True)
+class Tile:
+    """Pixels and samples that fill one worker once."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+    first_sample: int
+    sample_count: int
+
+
+class Worker:
+    """Path state, queues and launches of one thread (CPU) or of the whole device (CUDA)."""
+
+    def __init__(
+        self,
+        scene: description.Scene,
+        device_scene: DeviceScene,
+        features: Features,
+        kernels: Kernels,
+        film: Film,
+        seed: int,
+        capacity: int,
+        device: str,
+        profile: bool = False,
+    ):
+        self.device, self.capacity = device, capacity
+        self.captured = None  # the graph of a pass, on CUDA
+        self.capturing = False
+        self.profile = profile
+        self.stage_seconds: dict[str, float] = {}
+        self.queues = QueueSet(capacity, device, queue_names(features))
+        self.tile = wp.zeros(queues.TILE_FIELDS, dtype=wp.int32, device=device)
+        skip = skipped_arrays(features)
+        paths, surfaces, shadow_rays = (
+            allocate_struct(struct, capacity, device, skip[struct]) for struct in (Paths, Surfaces, ShadowRays)
+        )
+        self.paths, self.surfaces, self.shadow_rays = paths, surfaces, shadow_rays
+        d, q = device_scene, self.queues
+        counters, totals = q.counters, q.totals
+        seed = wp.uint64(seed)
+        width = film.width
+        scale = FILTER_SCALES[features.filter](scene.film.filter)
+        camera = make_camera(scene.camera, scene.film)
+        integrator = scene.integrator
+        rays, hits = q["rays"], q["hits"]
+        arguments = {
+            "generate": [camera, self.tile, width, scale, seed, paths, rays, counters, totals],
+            "intersect": [
+                *(d.geometry, paths, rays, integrator.max_depth),
+                *(surfaces, hits, q["escaped"], q["emissive"], counters),
+            ],
+            "escaped": [d.lights, paths, q["escaped"], counters],
+            "emission": [d.geometry, d.lights, d.textures, paths, surfaces, q["emissive"], counters],
+            "aov": [d.materials, d.textures, paths, surfaces, self.tile, width, film.arrays],
+            "direct": [
+                *(d.geometry, d.materials, d.textures, d.lights, paths, surfaces, hits, seed),
+                *(shadow_rays, q["shadow"], counters),
+            ],
+            "shadow": [d.geometry, shadow_rays, q["shadow"], paths],
+            "drain": [counters, totals],
+            "scatter": [
+                *(d.materials, d.textures, surfaces, hits, integrator.rr_depth or 0, seed),
+                *(paths, rays, counters),
+            ],
+            "advance": [counters],
+            "accumulate": [paths, self.tile, width, film.arrays],
+        }
+        self.commands = {
+            stage: wp.launch(kernel, dim=capacity, inputs=arguments[stage], device=device, record_cmd=True)
+            for stage, kernel in ((name, getattr(kernels, name)) for name in arguments)
+            if kernel is not None
+        }
+        self._arguments = arguments  # recorded commands do not keep their arrays alive
+
+    # --- the loop ------------------------------------------------------------------------------------------------
+
+    def trace_tile(self, tile: Tile) -> None:
+        """Traces all paths of a tile and adds them to the film."""
+        fields = np.array(dataclasses.astuple(tile), np.int32)
+        if self.device == "cpu":
+            self.tile.numpy()[:] = fields
+        else:
+            self.tile.assign(fields)
+        if self.device == "cpu" or self.profile:
+            self._trace(tile)
+            return
+        if self.captured is None:
+            self.captured = self.capture()
+        wp.capture_launch(self.captured)
+
+    def capture(self):
+        """Records a pass, whatever its tile, as one graph that runs without the host."""
+        self.capturing = True
+        try:
+            with wp.ScopedCapture(device=self.device) as capture:
+                self._trace(None)
+        finally:
+            self.capturing = False
+        return capture.graph
+
+    def _trace(self, tile: Tile | None) -> None:
+        pixels = tile.width * tile.height if tile else self.capacity
+        self._launch("generate", pixels * tile.sample_count if tile else self.capacity)
+        self._bounce(pixels)
+        wp.capture_while(self.queues.counters[queues.CONTINUE : queues.CONTINUE + 1], self._bounce)
+        self._launch("accumulate", pixels)
+
+    def _bounce(self, aov_pixels: int = 0) -> None:
+        self._launch("intersect", "rays")
+        self._launch("escaped", "escaped")
+        self._launch("emission", "emissive")
+        self._launch("aov", aov_pixels)
+        self._launch("direct", "hits")
+        self._launch("shadow", "shadow")
+        self._launch("drain", 1)
+        self._launch("scatter", "hits")
+        self._launch("advance", 1)
+
+    def _launch(self, stage: str, size: str | int) -> None:
+        """Launches a stage over a queue, or over a number of threads. The CPU device launches no more than is queued."""
+        command = self.commands.get(stage)
+        if command is None:
+            return
+        if isinstance(size, str):
+            exact = self.device == "cpu" and not self.capturing
+            size = self.queues.count(size) if exact else self.capacity
+        if size == 0:
+            return
+        command.set_dim(min(size, self.capacity))
+        start = time.perf_counter()
+        command.launch()
+        if self.device != "cpu":
+            if not self.profile:
+                return
+            wp.synchronize_device(self.device)
+        self.stage_seconds[stage] = self.stage_seconds.get(stage, 0.0) + time.perf_counter() - start
+
+    # --- what happened -------------------------------------------------------------------------------------------
+
+    def check_status(self) -> None:
+        """Raises WavefrontError where a kernel reported a failure."""
+        if self.queues.counters.numpy()[queues.STATUS] & queues.STATUS_QUEUE_OVERFLOW:
+            raise WavefrontError("a queue overflowed: the image would miss contributions (this is a bug)")
+
+    def nonfinite(self) -> dict[str, int]:
+        """Contributions left out, by stage."""
+        counters = self.queues.counters.numpy()
+        return {stage: int(counters[index]) for stage, index in queues.NONFINITE_STAGES.items()}
+
+
+def plan_tiles(width: int, height: int, capacity: int, first_sample: int, sample_count: int) -> list[Tile]:
+    """Tiles of at most `capacity` paths that cover the film once, in Morton-free scanline order.
+
+    Samples of one pixel share a tile as long as a tile keeps some hundred pixels, because their camera rays are alike.
+    """
+    samples = min(sample_count, max(1, capacity // 256))
+    pixels = max(1, capacity // samples)
+    side = max(1, int(pixels**0.5))
+    tile_width = min(width, side)
+    tile_height = min(height, max(1, pixels // tile_width))
+    tile_width = min(width, max(tile_width, pixels // tile_height))
+    tiles = []
+    for s in range(first_sample, first_sample + sample_count, samples):
+        count = min(samples, first_sample + sample_count - s)
+        for y in range(0, height, tile_height):
+            for x in range(0, width, tile_width):
+                tiles.append(Tile(x, y, min(tile_width, width - x), min(tile_height, height - y), s, count))
+    return tiles
+
+
+def run_tiles(workers: list[Worker], tiles: list[Tile]) -> None:
+    """Traces tiles on all workers, each on its own thread.
+
+    Tiles of the same pixels must be added in the order of their samples, so tiles are handed out by groups of the
+    same first sample, with a barrier in between.
+    """
+    groups: dict[int, list[Tile]] = {}
+    for tile in tiles:
+        groups.setdefault(tile.first_sample, []).append(tile)
+    for group in groups.values():
+        if len(workers) == 1:
+            for tile in group:
+                workers[0].trace_tile(tile)
+            continue
+        shared = deque(group)
+        errors: list[BaseException] = []
+
+        def work(worker: Worker, shared=shared, errors=errors):
+            try:
+                while shared and not errors:
+                    try:
+                        tile = shared.popleft()
+                    except IndexError:  # another worker took the last one
+                        return
+                    worker.trace_tile(tile)
+            except BaseException as error:
+                errors.append(error)
+
+        threads = [threading.Thread(target=work, args=(worker,), daemon=True) for worker in workers]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        if errors:
+            raise errors[0]
+
+
+PassCallback = Callable[["object"], None]

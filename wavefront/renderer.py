@@ -1,0 +1,220 @@
+"""The Python API: a renderer for one scene on one device."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import resource
+import sys
+import time
+from collections.abc import Callable
+
+import numpy as np
+import warp as wp
+
+from wavefront.errors import WavefrontError
+from wavefront.film import Film
+from wavefront.integrator import (
+    Worker,
+    make_features,
+    make_kernels,
+    plan_tiles,
+    run_tiles,
+    state_bytes_per_slot,
+)
+from wavefront.queues import TOTAL_PATHS, TOTAL_RAYS, TOTAL_SHADOW_RAYS
+from wavefront.scene.description import Scene
+from wavefront.scene.device import upload_scene
+from wavefront.scene.validate import validate
+
+CPU_CAPACITY = 1 << 14  # paths in flight per worker: their state stays in a core's second-level cache
+CUDA_CAPACITY = 1 << 21
+DEFAULT_MEMORY = 4 << 30
+PASS_SECONDS = 2.0  # aimed at: passes are where progress, time limits and Ctrl-C are looked at
+
+
+@dataclasses.dataclass
+class Statistics:
+    """What a render did so far. Times are wall time; stage times are summed over workers."""
+
+    sample_count: int = 0
+    paths: int = 0
+    rays: int = 0
+    shadow_rays: int = 0
+    compile_seconds: float = 0.0
+    render_seconds: float = 0.0
+    stage_seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+    nonfinite: dict[str, int] = dataclasses.field(default_factory=dict)
+
+
+def resolve_device(device: str) -> str:
+    """The alias of a Warp device.
+
+    Raises:
+        WavefrontError: There is no such device.
+    """
+    names = [d.alias for d in wp.get_devices()]
+    wanted = "cuda:0" if device == "cuda" else device
+    if wanted not in names:
+        raise WavefrontError(f"unknown device {device!r}; available: {', '.join(names)}")
+    return wanted
+
+
+def peak_memory_bytes() -> int:
+    """Largest resident size of this process so far, as the operating system counts it."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+class Renderer:
+    """Renders one scene; samples add up over calls of `render`.
+
+    Args:
+        scene: The records, from `wavefront.load_scene` or built in Python.
+        device: ``cpu``, ``cuda`` or ``cuda:N``.
+        threads: Workers on the CPU device; default: one per available core.
+        memory: Budget in bytes for the film and the path state.
+        seed: Of the random numbers. Same seed and device, same image.
+        profile: On CUDA, time every stage, at the price of a synchronisation after each.
+        on_compile: Called with a message before kernels are compiled.
+
+    Raises:
+        SceneError: The scene cannot be rendered.
+        WavefrontError: Unknown device, or a budget that is too small.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        device: str = "cpu",
+        threads: int | None = None,
+        memory: int = DEFAULT_MEMORY,
+        seed: int = 0,
+        profile: bool = False,
+        on_compile: Callable[[str], None] | None = None,
+    ):
+        if not 0 <= seed < 2**64:
+            raise WavefrontError(f"seed {seed} is out of range; allowed: 0 to 2^64 - 1")
+        if threads is not None and threads < 1:
+            raise WavefrontError(f"{threads} threads; allowed: 1 or more")
+        self.warnings = validate(scene)
+        self.scene, self.device, self.seed = scene, resolve_device(device), seed
+        self.device_scene = upload_scene(scene, self.device)
+        self.warnings += self.device_scene.notes
+        self.features = make_features(scene, self.device_scene)
+        self.kernels = make_kernels(self.features)
+        self.statistics = Statistics()
+        self._compile(on_compile)
+
+        film = scene.film
+        available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        self.threads = (threads or available or 1) if self.device == "cpu" else 1
+        aovs = self.features.aovs + (("variance",) if self.features.variance else ())
+        self.bytes_per_pixel = Film.bytes_per_pixel(aovs)
+        self.bytes_per_path = state_bytes_per_slot(self.features)
+        self.capacity = self._plan_capacity(memory, film.width * film.height)
+        self.film = Film(film.width, film.height, aovs, self.device)
+        self.workers = [
+            Worker(
+                *(scene, self.device_scene, self.features, self.kernels, self.film, seed),
+                *(self.capacity, self.device, profile),
+            )
+            for _ in range(self.threads)
+        ]
+
+    def _compile(self, on_compile) -> None:
+        start = time.perf_counter()
+        modules = self.kernels.modules()
+        if on_compile:
+            on_compile(f"compiling {len(modules)} kernels for {self.device} (cached for the next time)")
+        # All before the first launch and before any worker starts: a module that loads while another thread launches
+        # from it is not safe.
+        wp.force_load(self.device, modules=modules, max_workers=os.cpu_count() or 1)
+        self.statistics.compile_seconds = time.perf_counter() - start
+
+    def _plan_capacity(self, memory: int, pixels: int) -> int:
+        left = memory - pixels * self.bytes_per_pixel
+        capacity = min(
+            CPU_CAPACITY if self.device == "cpu" else CUDA_CAPACITY, left // (self.bytes_per_path * self.threads)
+        )
+        if capacity < 1024:
+            needed = pixels * self.bytes_per_pixel + 1024 * self.bytes_per_path * self.threads
+            raise WavefrontError(
+                f"a memory budget of {memory / 2**20:.0f} MiB is too small for {pixels} pixels on {self.threads} "
+                f"threads; at least {needed / 2**20:.0f} MiB is needed"
+            )
+        return int(capacity)
+
+    @property
+    def sample_count(self) -> int:
+        """Samples per pixel in the film."""
+        return self.film.sample_count
+
+    def render(
+        self,
+        spp: int | None = None,
+        seconds: float | None = None,
+        callback: Callable[[Renderer], bool | None] | None = None,
+    ) -> np.ndarray:
+        """Adds samples to the film and returns the image so far.
+
+        Args:
+            spp: Samples per pixel to add; default: the scene's, or without limit if `seconds` is given.
+            seconds: Wall time after which no further pass starts.
+            callback: Called after every pass; returning True ends the render there.
+
+        Returns:
+            Mean radiance, shape [height, width, 3], float32, linear Rec. 709.
+
+        Raises:
+            WavefrontError: `spp` or `seconds` is not positive.
+        """
+        if spp is not None and spp < 1:
+            raise WavefrontError(f"spp {spp}; allowed: 1 or more")
+        if seconds is not None and not seconds > 0.0:
+            raise WavefrontError(f"a time of {seconds} s; allowed: more than 0")
+        if spp is None:
+            spp = self.scene.integrator.spp if seconds is None else 2**31 - 1 - self.sample_count
+        if self.sample_count + spp > 2**31 - 1:
+            raise WavefrontError("more than 2^31 - 1 samples per pixel")
+        begin = time.perf_counter()
+        elapsed_before = self.statistics.render_seconds
+        target = self.sample_count + spp
+        samples = 1
+        while self.sample_count < target:
+            samples = min(samples, target - self.sample_count)
+            pass_start = time.perf_counter()
+            self._pass(samples)
+            now = time.perf_counter()
+            self.statistics.render_seconds = elapsed_before + now - begin
+            if callback is not None and callback(self):
+                break
+            if seconds is not None and now - begin >= seconds:
+                break
+            # The next pass: at most twice this one, at most PASS_SECONDS or what is left of the time.
+            duration = max(now - pass_start, 1e-6)
+            left = PASS_SECONDS if seconds is None else min(PASS_SECONDS, seconds - (now - begin))
+            samples = max(1, min(2 * samples, int(samples * left / duration)))
+        return self.film.image()
+
+    def _pass(self, samples: int) -> None:
+        film = self.film
+        run_tiles(self.workers, plan_tiles(film.width, film.height, self.capacity, film.sample_count, samples))
+        if self.device != "cpu":
+            wp.synchronize_device(self.device)
+        for worker in self.workers:
+            worker.check_status()
+        film.sample_count += samples
+        self._collect()
+
+    def _collect(self) -> None:
+        s = self.statistics
+        totals = sum(worker.queues.totals.numpy() for worker in self.workers)
+        s.sample_count = self.film.sample_count
+        s.paths, s.rays, s.shadow_rays = (int(totals[i]) for i in (TOTAL_PATHS, TOTAL_RAYS, TOTAL_SHADOW_RAYS))
+        s.stage_seconds, s.nonfinite = {}, {}
+        for worker in self.workers:
+            for stage, value in worker.stage_seconds.items():
+                s.stage_seconds[stage] = s.stage_seconds.get(stage, 0.0) + value
+            for stage, value in worker.nonfinite().items():
+                s.nonfinite[stage] = s.nonfinite.get(stage, 0) + value
