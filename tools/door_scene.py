@@ -65,7 +65,7 @@ def vase_profile() -> list[tuple[float, float]]:
 
 
 def _lamp():
-    return rectangle("lamp", (1.5, 2.55, -0.9), "-y", (0.4, 0.25), emitter=Area(radiance=[420.0, 370.0, 300.0]))
+    return rectangle("lamp", (1.5, 2.55, -0.9), "-y", (0.4, 0.25), emitter=Area(radiance=[2200.0, 2000.0, 1700.0]))
 
 
 def _rooms():
@@ -93,9 +93,7 @@ def _rooms():
 def _door():
     """The door turns about the left side of the opening, into the camera's room."""
     inset, width = 0.1, RIGHT - LEFT  # the hinge end is sunk into the wall and the lower one into the floor: no slits
-    hinge = [
-        *place(rotate=("y", -ANGLE), translate=(LEFT, 0.0, 0.0)),
-    ]
+    hinge = place(rotate=("y", -ANGLE), translate=(LEFT, 0.0, 0.0))
 
     def part(name, low, high, bsdf):
         half = [round((b - a) / 2, 4) for a, b in zip(low, high, strict=True)]

@@ -75,7 +75,7 @@ def write(folder: Path) -> list[str]:
 def cornell_box() -> Scene:
     """A room 2.2 m wide, 2 m high and deep; the camera stands before its open side."""
     return Scene(
-        description="A closed room with coloured walls, two boxes and one lamp: diffuse light transport at its plainest.",
+        description="A closed room with coloured walls, two boxes and one lamp: diffuse transport at its plainest.",
         camera=Perspective(fov=38.0, to_world=look_at((0, 1, 4.2), (0, 1, 0))),
         film=film(),
         integrator=PathIntegrator(max_depth=8),
@@ -125,13 +125,13 @@ def glossy_plates() -> Scene:
         shapes.append(plate)
     for i, radius in enumerate((0.025, 0.08, 0.25, 0.7)):
         # Of the same power, hence radiance falls with the square of the radius.
-        radiance = round(2.0 / radius**2, 3)
+        radiance = round(0.5 / radius**2, 3)
         at = (round(-1.95 + 1.3 * i - (0.1 if i < 3 else 0), 3), float(lights[1]), float(lights[2]))
         shapes.append(Sphere(name=f"light {i + 1}", center=at, radius=radius, emitter=Area(radiance=radiance)))
     return Scene(
         description="Four plates from nearly mirror to rough under four spherical lights of equal power and different "
         "size: light sampling is good in one corner, BSDF sampling in the opposite one, their combination in all.",
-        camera=Perspective(fov=36.0, to_world=look_at(tuple(camera), (0, 1.7, 0))),
+        camera=Perspective(fov=40.0, to_world=look_at(tuple(camera), (0, 1.25, 0))),
         film=film(320, 256),
         integrator=PathIntegrator(max_depth=6),
         bsdfs=[
@@ -177,7 +177,10 @@ def material_stage() -> Scene:
         textures=[
             Checkerboard(name="stage checks", color0=0.55, color1=0.3, uv_transform=((8.0, 0.0, 0.0), (0.0, 8.0, 0.0)))
         ],
-        bsdfs=[Diffuse(name="stage floor", reflectance="stage checks"), Diffuse(name="stage backdrop", reflectance=0.4)],
+        bsdfs=[
+            Diffuse(name="stage floor", reflectance="stage checks"),
+            Diffuse(name="stage backdrop", reflectance=0.4),
+        ],
         emitters=[Constant(name="stage sky", radiance=[0.15, 0.17, 0.2])],
         shapes=[
             rectangle("stage floor", (0, 0, 0), "+y", (4.0, 4.0), bsdf="stage floor"),
@@ -222,7 +225,8 @@ def material_balls(folder: Path) -> dict[str, Scene]:
 
 
 def _on_stage(folder: Path, what: str, bsdf: Bsdf, shape: Mesh | None) -> Scene:
-    subject = shape or Sphere(center=(0.0, 0.8, 0.0), radius=0.8)
+    # The poles of a sphere lie on its Z axis: turned upright.
+    subject = shape or Sphere(radius=0.8, to_world=place(rotate=("x", -90.0), translate=(0.0, 0.8, 0.0)))
     subject.name, subject.bsdf = "subject", bsdf
     return Scene(
         description=f"A material: {what}.",

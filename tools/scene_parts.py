@@ -27,11 +27,11 @@ def look_at(origin: tuple, target: tuple) -> list[TransformStep]:
 def place(scale=None, rotate: tuple[str, float] | None = None, translate=None) -> list[TransformStep]:
     """A transform that scales, then turns about an axis, then moves."""
     steps = []
-    if scale is not None:
+    if scale is not None and tuple(scale) != (1, 1, 1):
         steps.append(TransformStep(scale=_floats(scale)))
     if rotate is not None:
         steps.append(TransformStep(rotate=Rotate(axis=_AXES[rotate[0]], angle=rotate[1])))
-    if translate is not None:
+    if translate is not None and any(translate):
         steps.append(TransformStep(translate=_floats(translate)))
     return steps
 

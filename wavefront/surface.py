@@ -8,8 +8,8 @@ import warp as wp
 
 from wavefront.accel.mesh_query import Geometry, Hit
 
-# Bound on the relative error of an interpolated position and of a ray-triangle test against its own triangle, in
-# units of float32's 2^-24: a handful of roundings (Higham 2002, section 3.1), doubled to be safe.
+# Roundings in an interpolated position and in a ray-triangle test, in units of float32's 2^-24: a handful each (Higham
+# 2002, section 3.1), doubled to be safe.
 POSITION_ERROR = wp.constant(32.0 * 5.9604645e-8)
 
 
@@ -24,14 +24,18 @@ class Vertex:
 
 @wp.func
 def position_error(v0: wp.vec3, v1: wp.vec3, v2: wp.vec3, b0: float, b1: float, normal: wp.vec3) -> float:
-    """Bound on the rounding error of b0 v0 + b1 v1 + b2 v2 along the normal, in metres.
+    """How far along the normal a ray must start so that it cannot meet its own triangle again, in metres.
 
-    It follows the size of the coordinates that enter, so it is right for a scene of any scale and needs no epsilon
-    of the scene (Waechter and Binder 2019; Pharr, Jakob and Humphreys 2023, section 6.8).
+    Two errors add. The position b0 v0 + b1 v1 + b2 v2 is off the plane by roundings of its terms. And the ray-triangle
+    test finds the plane at a parameter that is off by roundings of the triangle's extent, even where the coordinates
+    along the normal are zero: on a floor at y = 0, a ray that leaves mostly along x meets the floor again without
+    this part. Both follow the numbers that enter, so the offset is right for a scene of any scale and needs no epsilon
+    of the scene (compare Waechter and Binder 2019; Pharr, Jakob and Humphreys 2023, section 6.8).
     """
     b2 = wp.abs(1.0 - b0 - b1)
     magnitude = b0 * wp.abs(v0) + b1 * wp.abs(v1) + b2 * wp.abs(v2)
-    return POSITION_ERROR * wp.dot(magnitude, wp.abs(normal))
+    extent = wp.max(wp.max(wp.abs(v1 - v0)), wp.max(wp.abs(v2 - v0)))
+    return POSITION_ERROR * (wp.dot(magnitude, wp.abs(normal)) + extent)
 
 
 @wp.func

@@ -1,9 +1,9 @@
-"""Coordinates on the sphere of directions in which a narrow lobe is as wide as any other.
+"""Coordinates for the directions of a lobe, in which a narrow or grazing lobe is as wide as any other.
 
-A chart is centred on a direction and has a width kappa. With theta the angle from the centre, tan(theta / 2) = kappa r,
-its coordinates in the unit square are w = 1 / sqrt(1 + r^2) and the azimuth b around the centre. It covers the whole
-sphere, half of it within theta = 2 atan(kappa). With t = tan(theta / 2),
-    d(omega) = 2 d(t^2) d(phi) / (1 + t^2)^2,   d(t^2) = kappa^2 2 dw / w^3,   d(phi) = 2 pi db.
+A direction wi is named by the normal m of the microfacet that reflects (or refracts) wo to wi: by the length of its
+slope r = slope / alpha as w = 1 / sqrt(1 + r^2), and by its azimuth b. Both are in [0, 1]. An area element of slopes is
+alpha^2 r dr d(phi) = alpha^2 2 pi dw db / w^3; from slopes to solid angle the Jacobian is taken by finite differences,
+so that no formula is shared with the code under test.
 """
 
 from __future__ import annotations
@@ -21,64 +21,68 @@ PER_CELL = 12
 
 @dataclass(frozen=True)
 class Chart:
-    """One half of the sphere of directions, z > 0 or z < 0, seen from the middle of a lobe."""
+    """Directions on the side of wo (index None), or on the other side of a boundary with index n_wi / n_wo."""
 
-    centre: np.ndarray
-    kappa: float
-    upper: bool
+    wo: np.ndarray
+    alpha: float
+    index: float | None
 
-    def basis(self) -> np.ndarray:
-        c = self.centre / np.linalg.norm(self.centre)
-        s = np.cross(c, [0.0, 1.0, 0.0] if abs(c[0]) > 0.5 else [1.0, 0.0, 0.0])
-        s /= np.linalg.norm(s)
-        return np.stack([s, np.cross(c, s), c])
+    def _upper(self) -> np.ndarray:
+        return self.wo * [1.0, 1.0, np.sign(self.wo[2])]
+
+    def _direction(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """wi for microfacets with slopes (x, y), wo above; NaN where there is none."""
+        o = self._upper()
+        m = np.stack([x, y, np.ones_like(x)], axis=1)
+        m /= np.linalg.norm(m, axis=1, keepdims=True)
+        c = m @ o
+        c[c <= 0.0] = np.nan
+        if self.index is None:
+            wi = 2.0 * c[:, None] * m - o
+            wi[wi[:, 2] <= 0.0] = np.nan
+        else:
+            n = self.index
+            square = 1.0 - (1.0 - c * c) / n**2
+            square[square <= 0.0] = np.nan
+            wi = (c / n - np.sqrt(square))[:, None] * m - o / n
+            wi[wi[:, 2] >= 0.0] = np.nan
+        return wi
 
     def directions(self) -> tuple[np.ndarray, np.ndarray]:
-        """Directions at the nodes of all cells, and the solid angle of each, zero in the other half."""
+        """Directions at the nodes of all cells, and the solid angle of each; zero where there is no direction."""
         w, b, area = nodes(SHAPE, PER_CELL)
-        t2 = self.kappa**2 * (1.0 - w) * (1.0 + w) / w**2
-        phi = 2.0 * np.pi * b
-        z = (1.0 - t2) / (1.0 + t2)
-        r = 2.0 * np.sqrt(t2) / (1.0 + t2)
-        wi = np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1) @ self.basis()
-        solid_angle = area * 8.0 * np.pi * self.kappa**2 / (w**3 * (1.0 + t2) ** 2)
-        return wi, np.where((wi[:, 2] > 0.0) == self.upper, solid_angle, 0.0)
+        slope = self.alpha * np.sqrt((1.0 - w) * (1.0 + w)) / w
+        x, y = slope * np.cos(2.0 * np.pi * b), slope * np.sin(2.0 * np.pi * b)
+        step = 1e-5 * (self.alpha + slope)
+        wi = self._direction(x, y)
+        dx = (self._direction(x + step, y) - self._direction(x - step, y)) / (2.0 * step)[:, None]
+        dy = (self._direction(x, y + step) - self._direction(x, y - step)) / (2.0 * step)[:, None]
+        jacobian = np.linalg.norm(np.cross(dx, dy), axis=1)
+        solid_angle = np.nan_to_num(jacobian) * area * 2.0 * np.pi * self.alpha**2 / w**3
+        wi = np.where(np.isfinite(wi), wi, [0.0, 0.0, 1.0]) * [1.0, 1.0, np.sign(self.wo[2])]
+        return wi, solid_angle
 
     def counts(self, wi: np.ndarray) -> np.ndarray:
-        """Samples of this half per cell."""
-        wi = wi[(wi[:, 2] > 0.0) == self.upper]
-        local = wi @ self.basis().T
-        distance2 = np.sum((wi - self.basis()[2]) ** 2, axis=1)  # 4 sin^2(theta / 2): exact for tiny angles
-        sin2 = np.minimum(0.25 * distance2, 1.0)
-        # 1 + r^2 = 1 + sin2 / (kappa^2 (1 - sin2))
-        k2 = self.kappa**2
-        w = np.sqrt(k2 * (1.0 - sin2) / (k2 * (1.0 - sin2) + sin2))
-        azimuth = np.mod(np.arctan2(local[:, 1], local[:, 0]) / (2.0 * np.pi), 1.0)
-        return histogram(w, azimuth, SHAPE)[:-1]
-
-
-def charts(name: str, wo: np.ndarray, alpha: float, ior: float) -> list[Chart]:
-    """Charts for the reflected and, where there is one, the transmitted lobe."""
-    if name == "diffuse":
-        return [Chart(np.array([0.0, 0.0, 1.0]), 1.0, True)]
-    reflected = Chart(wo * [-1.0, -1.0, 1.0], alpha, bool(wo[2] > 0.0))
-    if name == "rough_conductor":
-        return [reflected]
-    n = ior if wo[2] > 0.0 else 1.0 / ior
-    # Under total reflection the lobe that some microfacets transmit lies near the horizon.
-    cos_t = np.sqrt(max(1.0 - (1.0 - wo[2] ** 2) / n**2, 1e-4))
-    refracted = np.array([-wo[0] / n, -wo[1] / n, -np.sign(wo[2]) * cos_t])
-    kappa = 0.5 * alpha * abs(1.0 - 1.0 / n)
-    return [reflected, Chart(refracted, kappa, bool(wo[2] < 0.0))]
+        """Samples on this side per cell."""
+        o = self._upper()
+        i = wi * [1.0, 1.0, np.sign(self.wo[2])]
+        i = i[i[:, 2] > 0.0] if self.index is None else self.index * i[i[:, 2] < 0.0]
+        h = o + i
+        r2 = (h[:, 0] ** 2 + h[:, 1] ** 2) / (self.alpha * h[:, 2]) ** 2
+        slopes = h[:, :2] * np.sign(h[:, 2:])
+        azimuth = np.mod(np.arctan2(slopes[:, 1], slopes[:, 0]) / (2.0 * np.pi), 1.0)
+        return histogram(1.0 / np.sqrt(1.0 + r2), azimuth, SHAPE)[:-1]
 
 
 def integrate(name: str, p, wo: np.ndarray, alpha: float, ior: float) -> tuple[np.ndarray, np.ndarray, list[Chart]]:
-    """pdf of all cells of all charts; integral of f |cos| per chart and channel; the charts."""
-    all_charts = charts(name, wo, alpha, ior)
+    """Probability of all cells of all charts; integral of f |cos| per chart and channel; the charts."""
+    charts = [Chart(wo, alpha, None)]
+    if name == "rough_dielectric":
+        charts.append(Chart(wo, alpha, ior if wo[2] > 0.0 else 1.0 / ior))
     probabilities, values = [], []
-    for chart in all_charts:
+    for chart in charts:
         wi, solid_angle = chart.directions()
         e = harness.evaluate(name, p, wo, wi)
         probabilities.append(cell_sums(e.pdf * solid_angle, SHAPE, PER_CELL))
         values.append((e.value * solid_angle[:, None]).sum(axis=0))
-    return np.concatenate(probabilities), np.array(values), all_charts
+    return np.concatenate(probabilities), np.array(values), charts

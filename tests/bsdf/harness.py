@@ -29,6 +29,9 @@ DEVICE = "cpu"
 LARGEST_UNIFORM = 1.0 - 2.0**-24
 
 
+Fresnel5 = wp.types.vector(length=5, dtype=wp.float32)
+
+
 @wp.struct
 class Parameters:
     """Parameters of every BSDF under test; each reads its own."""
@@ -163,12 +166,12 @@ def _fresnel_kernel(
     eta: wp.vec3,
     k: wp.vec3,
     # outputs
-    dielectric: wp.array(dtype=wp.vec4),
+    dielectric: wp.array(dtype=Fresnel5),
     conductor: wp.array(dtype=wp.vec3),
 ):
     i = wp.tid()
     f = fresnel_dielectric(cos_i[i], ior)
-    dielectric[i] = wp.vec4(f.reflectance, f.cos_t, f.eta, f.inv_eta)
+    dielectric[i] = Fresnel5(f.reflectance, f.cos_t, f.eta, f.inv_eta, f.transmittance)
     conductor[i] = fresnel_conductor(cos_i[i], eta, k)
 
 
@@ -253,9 +256,9 @@ def microfacet_terms(wo, m, alpha: float, distribution: int) -> tuple[np.ndarray
 
 
 def fresnel(cos_i, ior: float = 1.5, eta=(0.0, 0.0, 0.0), k=(1.0, 1.0, 1.0)) -> tuple[np.ndarray, np.ndarray]:
-    """Dielectric rows (reflectance, cos_t, eta, 1 / eta), and conductor reflectances."""
+    """Dielectric rows (reflectance, cos_t, eta, 1 / eta, transmittance), and conductor reflectances."""
     c = np.ascontiguousarray(cos_i, dtype=np.float32)
-    dielectric = wp.empty(len(c), dtype=wp.vec4, device=DEVICE)
+    dielectric = wp.empty(len(c), dtype=Fresnel5, device=DEVICE)
     conductor = wp.empty(len(c), dtype=wp.vec3, device=DEVICE)
     inputs = [wp.array(c, dtype=float, device=DEVICE), ior, wp.vec3(*eta), wp.vec3(*k)]
     wp.launch(_fresnel_kernel, dim=len(c), inputs=inputs, outputs=[dielectric, conductor], device=DEVICE)

@@ -25,6 +25,11 @@ def test_dielectric_reflectance(ior, side):
     np.testing.assert_allclose(result[:, 2], n, rtol=2e-7)
     np.testing.assert_allclose(result[:, 3], 1.0 / n, rtol=2e-7)
     assert np.all(result[p2 < -1e-5, 0] == 1.0)
+    assert np.all(result[p2 < -1e-5, 4] == 0.0)
+    root = np.sqrt(np.maximum(p2, 0.0))
+    transmittance = 2.0 * c * root * (1.0 / (c + root) ** 2 + n**2 / (n**2 * c + root) ** 2)
+    np.testing.assert_allclose(result[clear, 4], transmittance[clear], rtol=1e-2 if ior < 1.001 else 5e-4)
+    np.testing.assert_allclose(result[:, 0] + result[:, 4], 1.0, atol=4e-7)
     assert np.all((result[:, 0] >= 0.0) & (result[:, 0] <= 1.0))
 
 
@@ -45,6 +50,7 @@ def test_no_boundary():
     c = np.array([1.0, 0.5, 1e-4, 0.0, -0.0, -0.3, -1.0], dtype=np.float32)
     result, _ = harness.fresnel(c, ior=1.0)
     np.testing.assert_array_equal(result[:, 0], 0.0)
+    np.testing.assert_array_equal(result[:, 4], 1.0)
     np.testing.assert_array_equal(result[:, 1], -c)
 
 

@@ -12,19 +12,34 @@ class FresnelDielectric:
     """Reflectance at a smooth boundary and where the refracted ray goes."""
 
     reflectance: float
+    transmittance: float  # 1 - reflectance, to full relative precision also where nearly everything is reflected
     cos_t: float  # cosine of the transmitted direction, of the other sign than cos_i; 0 under total reflection
     eta: float  # n_transmitted / n_incident
     inv_eta: float
 
 
 @wp.func
+def fresnel_refracting(c: float, p: float, n: float, e: float) -> wp.vec2:
+    """(reflectance, transmittance) of a ray that refracts: c = |cos_i|, p = n |cos_t| > 0, n = n_t / n_i, e = n^2 - 1.
+
+    The amplitudes are r_s = (c - p) / (c + p) and r_p = (n^2 c - p) / (n^2 c + p). Snell's law says p^2 - c^2 = e, so
+    both numerators have the factor e, which is taken out exactly:
+        r_s = -e / (c + p)^2                r_p = e (c (c + p) - 1) / ((c + p) (n^2 c + p)).
+    What is not reflected is 1 - r_s^2 = 4 c p / (c + p)^2 and 1 - r_p^2 = 4 n^2 c p / (n^2 c + p)^2.
+    """
+    s = c + p
+    q = n * n * c + p
+    r_s = e / (s * s)
+    r_p = e * (c * s - 1.0) / (s * q)
+    t = 2.0 * c * p * (1.0 / (s * s) + n * n / (q * q))
+    return wp.vec2(wp.min(0.5 * (r_s * r_s + r_p * r_p), 1.0), wp.min(t, 1.0))
+
+
+@wp.func
 def fresnel_dielectric(cos_i: float, eta: float) -> FresnelDielectric:
     """Fresnel's equations for a boundary with relative index eta = n_below / n_above; cos_i < 0 comes from below.
 
-    With c = |cos_i|, n = n_t / n_i, p = n |cos_t|, Snell's law gives p^2 = n^2 - 1 + c^2, and the amplitudes are
-        r_s = (c - p) / (c + p)             r_p = (n^2 c - p) / (n^2 c + p).
-    As c^2 - p^2 = -(n^2 - 1) =: -e, both numerators have the factor e, which is taken out exactly:
-        r_s = -e / (c + p)^2                r_p = e (c (c + p) - 1) / ((c + p) (n^2 c + p)).
+    With n = n_t / n_i, Snell's law is p^2 = n^2 - 1 + c^2, negative under total reflection.
     """
     result = FresnelDielectric()
     c = wp.abs(cos_i)
@@ -38,18 +53,19 @@ def fresnel_dielectric(cos_i: float, eta: float) -> FresnelDielectric:
     if e == 0.0:
         # No boundary at all: everything passes straight on, at every angle.
         result.reflectance = 0.0
+        result.transmittance = 1.0
         result.cos_t = -cos_i
     else:
         p2 = e + c * c
         if p2 <= 0.0:
             result.reflectance = 1.0
+            result.transmittance = 0.0
             result.cos_t = 0.0
         else:
             p = wp.sqrt(p2)
-            s = c + p
-            r_s = e / (s * s)
-            r_p = e * (c * s - 1.0) / (s * (n * n * c + p))
-            result.reflectance = wp.min(0.5 * (r_s * r_s + r_p * r_p), 1.0)
+            split = fresnel_refracting(c, p, n, e)
+            result.reflectance = split[0]
+            result.transmittance = split[1]
             result.cos_t = wp.where(cos_i < 0.0, p, -p) / n
     return result
 

@@ -46,11 +46,11 @@ def eval_rough_conductor(
     wo: wp.vec3,
     wi: wp.vec3,
 ) -> BsdfEval:
-    """Both cosines to the half vector m = h / |h|, h = wo + wi, are |h| / 2."""
+    """Both cosines to the half vector m = h / |h|, h = wo + wi, are |h| / 2; |h|^2 may underflow to zero."""
     result = no_eval()
-    if wo[2] > 0.0 and wi[2] > 0.0:
-        h = wo + wi
-        length = wp.length(h)
+    h = wo + wi
+    length = wp.length(h)
+    if wo[2] > 0.0 and wi[2] > 0.0 and length > 0.0:
         m = h / length
         result.pdf = 0.25 * microfacet_d(m, alpha, distribution) * smith_g1_over_cos(wo, alpha, distribution)
         reflectance = fresnel_conductor(0.5 * length, eta, k)

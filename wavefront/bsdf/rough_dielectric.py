@@ -15,7 +15,7 @@ For eta = 1 nothing refracts: the boundary is invisible, and light passes as a d
 
 import warp as wp
 
-from wavefront.bsdf.fresnel import fresnel_dielectric
+from wavefront.bsdf.fresnel import fresnel_dielectric, fresnel_refracting
 from wavefront.bsdf.microfacet import microfacet_d, sample_visible_normal, smith_g1, smith_g1_over_cos
 from wavefront.bsdf.record import BsdfEval, BsdfSample, no_eval, no_sample
 
@@ -56,7 +56,7 @@ def sample_rough_dielectric(
             # |h| = |wo.m - n cos_t| without the cancellation: the squares differ by 1 - n^2 (Snell's law).
             h = (n - 1.0) * (n + 1.0) / (cos_m + n * cos_t)
             jacobian = n * n * cos_t / (h * h)
-            pdf = (1.0 - fresnel.reflectance) * density * cos_m * jacobian
+            pdf = fresnel.transmittance * density * cos_m * jacobian
             if i[2] < 0.0 and pdf > 0.0:
                 result.wi = wp.vec3(i[0], i[1], side * i[2])
                 result.weight = (
@@ -88,10 +88,11 @@ def eval_rough_dielectric(
         if i[2] > 0.0:
             h = o + i
             length = wp.length(h)
-            m = h / length
-            fresnel = fresnel_dielectric(side * 0.5 * length, eta)
-            result.pdf = 0.25 * fresnel.reflectance * microfacet_d(m, alpha, distribution) * g1_over_cos
-            result.value = (result.pdf * g1) * specular_reflectance
+            if length > 0.0:
+                m = h / length
+                fresnel = fresnel_dielectric(side * 0.5 * length, eta)
+                result.pdf = 0.25 * fresnel.reflectance * microfacet_d(m, alpha, distribution) * g1_over_cos
+                result.value = (result.pdf * g1) * specular_reflectance
         else:
             h = o + n * i
             length = wp.length(h)
@@ -101,9 +102,10 @@ def eval_rough_dielectric(
                 cos_o = wp.dot(o, m)
                 cos_i = wp.dot(i, m)
                 if cos_o > 0.0 and cos_i < 0.0:
-                    fresnel = fresnel_dielectric(side * cos_o, eta)
+                    # Both cosines are known: near the critical angle that is better than Snell's law from one of them.
+                    split = fresnel_refracting(cos_o, -n * cos_i, n, (n - 1.0) * (n + 1.0))
                     density = microfacet_d(m, alpha, distribution) * g1_over_cos * cos_o
                     jacobian = n * n * wp.abs(cos_i) / (length * length)
-                    result.pdf = (1.0 - fresnel.reflectance) * density * jacobian
+                    result.pdf = split[1] * density * jacobian
                     result.value = (result.pdf * g1 / (n * n)) * specular_transmittance
     return result

@@ -8,6 +8,7 @@ from __future__ import annotations
 import difflib
 import functools
 import re
+import sys
 
 from msgspec import inspect
 
@@ -38,6 +39,8 @@ def explain(raw: object, error: Exception) -> tuple[list[Step], str, str | None]
             return [*steps, "type"] if at_type else steps, message, key
     if tag is not None:
         steps.append(tag)
+    if isinstance(value, int) and abs(value) > sys.float_info.max:
+        return steps, f"the number {found(value)} is too large", None
     if not isinstance(value, (dict, list)) or not _allows(types, value):
         return steps, f"expected {allowed(types)}; found {found(value)}", None
     return steps, _first_line(error), None
@@ -78,7 +81,7 @@ def allowed(types: tuple[inspect.Type, ...]) -> str:
             if kind.tag is None:
                 words.append("an object")
         elif isinstance(kind, inspect.StrType):
-            words.append("a name" if tags else "a string")
+            words.append("a name" if tags else _singular(kind))
         else:
             words.append(_singular(kind))
     if tags:
@@ -111,8 +114,11 @@ def _descend(raw, steps):
     for step in steps:
         parent, value = value, value[step]
         if isinstance(step, int):
-            inner = [t.item_type if isinstance(t, inspect.ListType) else t.item_types[min(step, len(t.item_types) - 1)]
-                     for t in types if isinstance(t, (inspect.ListType, inspect.TupleType))]
+            inner = [
+                t.item_type if isinstance(t, inspect.ListType) else t.item_types[min(step, len(t.item_types) - 1)]
+                for t in types
+                if isinstance(t, (inspect.ListType, inspect.TupleType))
+            ]
         else:
             records = [t for t in types if isinstance(t, inspect.StructType)]
             told = [t for t in records if t.tag == parent.get("type")] or records
@@ -176,7 +182,7 @@ def _singular(kind):
     if isinstance(kind, inspect.LiteralType):
         return _either([repr(value) for value in kind.values])
     if isinstance(kind, inspect.StrType):
-        return "a string"
+        return "a string that is not empty" if kind.min_length else "a string"
     if isinstance(kind, inspect.IntType):
         return "an integer" + _range(kind)
     if isinstance(kind, inspect.FloatType):
@@ -208,8 +214,11 @@ def _plural(kind):
 
 
 def _range(kind):
-    bounds = [f"{sign} {bound:g}" if isinstance(bound, float) else f"{sign} {bound}"
-              for sign, bound in ((">=", kind.ge), (">", kind.gt), ("<=", kind.le), ("<", kind.lt)) if bound is not None]
+    bounds = [
+        f"{sign} {bound:g}" if isinstance(bound, float) else f"{sign} {bound}"
+        for sign, bound in ((">=", kind.ge), (">", kind.gt), ("<=", kind.le), ("<", kind.lt))
+        if bound is not None
+    ]
     return " " + " and ".join(bounds) if bounds else ""
 
 
@@ -225,5 +234,3 @@ def _shorten(text):
 def _first_line(error):
     text = str(error) or type(error).__name__
     return shown(text)[1:-1] if not text.isprintable() else text
-
-

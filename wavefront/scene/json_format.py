@@ -5,7 +5,6 @@ Reading: parse, apply overrides, convert to records, add what is included, make 
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import re
@@ -25,10 +24,15 @@ _INCLUDE_KEYS = (*INCLUDABLE, "description", "include")
 _OVERRIDE_STEP = re.compile(r"([A-Za-z_]\w*)((?:\[\d{1,9}\])*)")
 _LINE_LENGTH = 120
 
+# A string, which is stepped over, or a number that Python's parser would take or refuse but that is not in JSON.
+_BAD_NUMBER = re.compile(r'"(?:\\.|[^"\\])*"|(NaN|-?Infinity|\d{1000,})')
+
 # --- reading ---------------------------------------------------------------------------------------------------
 
 
-def load(path: str | os.PathLike, overrides: Sequence[str] = (), warn: Callable[[str], object] | None = None) -> description.Scene:
+def load(
+    path: str | os.PathLike, overrides: Sequence[str] = (), warn: Callable[[str], object] | None = None
+) -> description.Scene:
     """Reads a scene file, with what it includes.
 
     Args:
@@ -52,7 +56,9 @@ def load(path: str | os.PathLike, overrides: Sequence[str] = (), warn: Callable[
     return scene
 
 
-def with_overrides(scene: description.Scene, overrides: Sequence[str], file: str | os.PathLike | None = None) -> description.Scene:
+def with_overrides(
+    scene: description.Scene, overrides: Sequence[str], file: str | os.PathLike | None = None
+) -> description.Scene:
     """A copy of `scene` with `overrides` applied, as `load` does; new file paths are relative to `file`. Not validated.
 
     Raises:
@@ -89,7 +95,7 @@ def _object(pairs):
 
 
 def _refuse_constant(name):
-    raise ValueError(f"{name} is not a number of JSON")
+    raise ValueError(name)
 
 
 _DECODER = json.JSONDecoder(object_pairs_hook=_object, parse_constant=_refuse_constant)
@@ -124,17 +130,27 @@ def _parse(text, path):
         raise SceneError(f"not JSON: {error.msg[:1].lower()}{error.msg[1:]}", path, where) from None
     except RecursionError:
         raise SceneError("nested too deeply", path) from None
-    except ValueError as error:  # a constant such as NaN, or an integer of thousands of digits
-        raise SceneError(f"not JSON: {str(error).partition(';')[0]}", path) from None
+    except ValueError:
+        raise _bad_number(text, path) from None
     for steps, item in _containers(raw):
         if isinstance(item, _RepeatedKey):
             raise SceneError(f"the key {shown(item.key)} is given twice", path, _printable_path(steps))
     return raw
 
 
+def _bad_number(text, path):
+    """The error for what the parser refuses without saying where: a constant such as NaN, or an endless integer."""
+    for match in _BAD_NUMBER.finditer(text):
+        if match[1]:
+            line, column = text.count("\n", 0, match.start()) + 1, match.start() - text.rfind("\n", 0, match.start())
+            what = f"an integer of {len(match[1])} digits" if match[1].isdigit() else match[1]
+            return SceneError(f"not JSON: {what} is not a number here", path, f"line {line}, column {column}")
+    return SceneError("not JSON: a number cannot be read", path)
+
+
 def _containers(raw):
     """All objects in `raw` with the steps to them; lists of numbers are not looked into."""
-    stack = [([], raw)]
+    stack = [([], raw)] if isinstance(raw, (dict, list)) else []
     while stack:
         steps, item = stack.pop()
         if isinstance(item, dict):
@@ -179,7 +195,8 @@ def _apply_override(raw, override, path):
     name, equals, text = override.partition("=")
     steps = _parse_override_path(name)
     if not equals or steps is None:
-        raise SceneError(f"bad override {shown(override)}; expected a path and a value such as integrator.max_depth=6", path)
+        message = f"bad override {shown(override)}; expected a path and a value such as integrator.max_depth=6"
+        raise SceneError(message, path)
     try:
         value = _parse(text, path)
     except SceneError:
@@ -280,18 +297,14 @@ def dump(scene: description.Scene, path: str | os.PathLike) -> None:
     """Writes `scene` to `path`; ``load`` gives an equal scene back. The file is replaced whole or not at all.
 
     Raises:
-        SceneError: The file cannot be written, or a number is not finite.
+        SceneError: A number is not finite.
+        WavefrontError: The file cannot be written.
     """
-    path = Path(path)
-    text = dumps(scene, path.parent)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    from wavefront.scene.images import replacing  # only here: reading a scene needs no image libraries
+
+    text = dumps(scene, Path(path).parent)
+    with replacing(path) as temporary:
         temporary.write_bytes(text.encode())
-        os.replace(temporary, path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        raise SceneError(f"cannot be written: {error.strerror}", path) from None
 
 
 def dumps(scene: description.Scene, base_dir: str | os.PathLike) -> str:
@@ -333,11 +346,11 @@ def _relative(file, base_dir):
 
 def _write(value, indent, used):
     """JSON text of `value`, on one line if it fits there after `used` characters, number rows one per line."""
-    if not isinstance(value, (dict, list)):
+    if not isinstance(value, (dict, list)) or not value:
         return json.dumps(value, allow_nan=False)
     inner = indent + "  "
     if isinstance(value, list) and _is_table(value):
-        if len(value) > 3 or not value:
+        if len(value) > 3:
             rows = json.dumps(value, allow_nan=False)
             return rows.replace("[[", f"[\n{inner}[").replace("], [", f"],\n{inner}[").replace("]]", f"]\n{indent}]")
         return json.dumps(value, allow_nan=False)
@@ -386,7 +399,7 @@ def schema() -> dict:
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "Wavefront scene",
-        "description": "Right-handed, Y up, metres, degrees, linear Rec. 709 colour. File paths are relative to the file.",
+        "description": "Right-handed, Y up, metres, degrees, linear Rec. 709 colour; paths are relative to the file.",
         **generated,
     }
 

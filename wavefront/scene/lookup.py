@@ -16,17 +16,20 @@ TEXTURE_FIELDS = frozenset(
 BSDF_FIELDS = frozenset(("bsdf", "front", "back"))
 # Long lists of numbers, in which there is no record to find.
 NUMBER_FIELDS = frozenset(("vertices", "faces", "normals", "uvs"))
+_LISTED = 24  # names that a message lists at most
 
 _DEFAULT_BSDF = description.Diffuse()
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:
-    """The message for a name that is not known: the nearest known one, then all of them."""
+    """The message for a name that is not known: the nearest known one, then all of them unless there are many."""
     names = sorted(known)
+    if not names:
+        return f"unknown {kind} {shown(name)}; none is defined"
     close = difflib.get_close_matches(name, names, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else ";"
-    listed = f"known: {', '.join(map(shown, names))}" if names else "none is defined"
-    return f"unknown {kind} {shown(name)}{hint} {listed}"
+    hint = f"; did you mean {shown(close[0])}?" if close else ";"
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return f"unknown {kind} {shown(name)}{hint} known: {', '.join(map(shown, names[:_LISTED]))}{more}"
 
 
 def shown(text: str) -> str:
@@ -73,8 +76,9 @@ def walk(record: description.Record, path: str = "") -> Iterator[tuple[str, desc
         if isinstance(item, description.Record):
             yield path, item
             prefix = path + "." if path else ""
-            children = [(prefix + name, getattr(item, name)) for name in item.__struct_fields__
-                        if name not in NUMBER_FIELDS]
+            children = [
+                (prefix + name, getattr(item, name)) for name in item.__struct_fields__ if name not in NUMBER_FIELDS
+            ]
         else:
             children = [(f"{path}[{i}]", child) for i, child in enumerate(item)]
         stack.extend(child for child in reversed(children) if isinstance(child[1], (description.Record, list)))

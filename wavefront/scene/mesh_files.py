@@ -7,16 +7,19 @@ they leave out silently what they cannot read.
 
 from __future__ import annotations
 
+import base64
 import functools
 import io
+import json
 import os
 import re
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import trimesh
-from trimesh.exchange.gltf import load_glb, load_gltf
+from trimesh.exchange.gltf import load_gltf
 from trimesh.exchange.obj import load_obj
 from trimesh.exchange.ply import load_ply
 from trimesh.resolvers import FilePathResolver
@@ -62,10 +65,8 @@ def read_mesh(path: str, where: str = "") -> FileMesh:
         if not os.path.isfile(path):
             raise SceneError(f"{path}: not a file", path=where)
         mesh = _read(os.path.abspath(path), suffix, stat.st_mtime_ns, stat.st_size)
-    except FileNotFoundError as error:
-        missing = error.filename if error.filename not in (None, path) else None
-        message = f"needs {missing}, which does not exist" if missing else "file not found"
-        raise SceneError(f"{path}: {message}", path=where) from None
+    except FileNotFoundError:
+        raise SceneError(f"{path}: file not found", path=where) from None
     except OSError as error:
         raise SceneError(f"{path}: cannot be read: {error.strerror or error}", path=where) from None
     except _Unreadable as error:
@@ -78,7 +79,7 @@ def clear_cache() -> None:
     _read.cache_clear()
 
 
-@functools.lru_cache(maxsize=256)
+@functools.lru_cache(maxsize=1024)
 def _read(path, suffix, _mtime, _size):
     readers = {".ply": _read_ply, ".obj": _read_obj, ".gltf": _read_gltf, ".glb": _read_gltf}
     try:
@@ -160,7 +161,8 @@ def _read_obj(path):
         ("normals", normals, rb"(?m)^f +\d+/\d*/\d"),
     ):
         if found is None and re.search(pattern, data):
-            raise _Unreadable(f"the {name} of its faces cannot be read: some faces have none, or an index is out of range")
+            reason = "some faces have none, or an index is out of range"
+            raise _Unreadable(f"the {name} of its faces cannot be read: {reason}")
     return FileMesh(_floats(mesh["vertices"]), _triangles(mesh["faces"]), _floats(normals), _floats(uvs))
 
 
@@ -172,9 +174,21 @@ def _has_groups(data):
 
 
 def _read_gltf(path):
-    with open(path, "rb") as file:
-        loader = load_glb if path.lower().endswith(".glb") else load_gltf
-        data = loader(file, resolver=FilePathResolver(path), skip_materials=True, merge_primitives=False)
+    tree = _gltf_tree(Path(path).read_bytes())
+    for primitive in _primitives(tree):
+        # trimesh reads UVs only beside a material, but attributes with an underscore always
+        attributes = primitive.get("attributes", {})
+        if "TEXCOORD_0" in attributes:
+            attributes["_UV"] = attributes["TEXCOORD_0"]
+    try:
+        data = load_gltf(
+            io.BytesIO(json.dumps(tree).encode()),
+            resolver=FilePathResolver(path),
+            skip_materials=True,
+            merge_primitives=False,
+        )
+    except FileNotFoundError as error:
+        raise _Unreadable(f"needs the file {str(error)!r}, which does not exist") from None
     graph = SceneGraph(base_frame=data.get("base_frame", "world"))
     for edge in data["graph"]:
         graph.update(**edge)
@@ -190,6 +204,26 @@ def _read_gltf(path):
     return _merged(parts)
 
 
+def _gltf_tree(data):
+    """The JSON of a glTF or GLB file; the binary chunk of a GLB becomes a data URI."""
+    if data[:4] != b"glTF":
+        return json.loads(data)
+    chunks, position = {}, 12
+    while position + 8 <= len(data):
+        length, kind = struct.unpack_from("<I4s", data, position)
+        chunks.setdefault(kind, data[position + 8 : position + 8 + length])
+        position += 8 + length
+    tree = json.loads(chunks[b"JSON"])
+    if b"BIN\0" in chunks and tree.get("buffers"):
+        blob = base64.b64encode(chunks[b"BIN\0"]).decode()
+        tree["buffers"][0].setdefault("uri", f"data:application/octet-stream;base64,{blob}")
+    return tree
+
+
+def _primitives(tree):
+    return [primitive for mesh in tree.get("meshes", []) for primitive in mesh.get("primitives", [])]
+
+
 def _gltf_part(kwargs, matrix):
     vertices = np.asarray(kwargs["vertices"], np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
     faces = _triangles(kwargs["faces"])
@@ -198,10 +232,9 @@ def _gltf_part(kwargs, matrix):
         normals = normals @ np.linalg.inv(matrix[:3, :3])
     if np.linalg.det(matrix[:3, :3]) < 0.0:
         faces = faces[:, ::-1]
-    uvs = getattr(kwargs.get("visual"), "uv", None)
-    if uvs is not None:
-        # trimesh turns v upside down on reading; glTF's own v is ours
-        uvs = np.column_stack([uvs[:, 0], 1.0 - np.asarray(uvs[:, 1], np.float64)])
+    uvs = kwargs.get("vertex_attributes", {}).get("_UV")
+    if uvs is not None and uvs.dtype.kind == "u":
+        uvs = uvs / float(np.iinfo(uvs.dtype).max)  # integers stand for [0, 1]
     return FileMesh(vertices, faces, normals, _floats(uvs))
 
 

@@ -64,17 +64,18 @@ def tessellate(shape: description.AnyShape, where: str = "") -> TriangleMesh:
     else:
         raise SceneError(f"a {type(shape).__name__.lower()} has no triangles", path=where)
 
+    prefix = f"{shape.file}: " if getattr(shape, "file", None) else ""
     with np.errstate(over="ignore", invalid="ignore"):  # reported by the check below
         vertices = (vertices @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
     if not np.isfinite(vertices).all():
-        raise SceneError("a vertex is outside the range of 32-bit floats after to_world", path=where)
+        raise SceneError(f"{prefix}a vertex leaves the range of 32-bit floats after to_world", path=where)
     if normals is not None:
         normals = normals @ np.linalg.inv(matrix[:3, :3])
     if is_mirror(matrix):
         faces = faces[:, ::-1]
     kept = _has_area(vertices, faces)
     if not kept.any():
-        raise SceneError("empty mesh: all of its triangles have zero area", path=where)
+        raise SceneError(f"{prefix}empty mesh: all of its triangles have zero area", path=where)
     dropped = int(len(faces) - kept.sum())
     faces = np.ascontiguousarray(faces[kept], np.int32)
     if normals is not None:

@@ -1,14 +1,15 @@
 """Mitsuba XML to a tree of plugins: files, includes, parameters, references and the names of old dialects.
 
 This module knows the grammar of the format and nothing of rendering; `wavefront.scene.mitsuba` gives the plugins their
-meaning. The grammar is that of Mitsuba 3.9, whose upgrade rules for files of version 0.x and 1.x are applied (snake_case
-names, `diffuse_reflectance` of a diffuse BSDF, `uscale` and its kin to `to_uv`); `srgb` and `lookAt` of Mitsuba 0.5 and
-0.6 are also understood.
+meaning. The grammar is that of Mitsuba 3.9, whose upgrade rules for files of version 0.x are applied (snake_case names,
+`diffuse_reflectance` of a diffuse BSDF, `uscale` and its kin to `to_uv`); `srgb` and `lookAt` of Mitsuba 0.5 and 0.6
+are also understood.
 """
 
 from __future__ import annotations
 
 import difflib
+import os
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -18,56 +19,16 @@ from xml.parsers import expat
 import numpy as np
 
 from wavefront.errors import SceneError
-from wavefront.scene import transforms
+from wavefront.scene.mitsuba_values import STEP_TAGS, Element, nearest, to_matrix, to_number, to_xyz
 
 OBJECT_TAGS = (
     "scene", "bsdf", "emitter", "film", "integrator", "medium", "phase", "rfilter", "sampler", "sensor", "shape",
     "texture", "volume", "subsurface",
 )  # fmt: skip
 PROPERTY_TAGS = ("boolean", "float", "integer", "string", "point", "vector", "rgb", "srgb", "spectrum", "transform")
-_STEP_TAGS = ("translate", "rotate", "scale", "lookat", "matrix")
 _OTHER_TAGS = ("ref", "include", "alias", "default", "path")
 _OLD_TAGS = {"luminaire": "emitter", "camera": "sensor", "blackbody": "rgb"}
 _MAX_INCLUDES = 15
-
-
-@dataclass
-class Element:
-    """One XML element and where it starts."""
-
-    tag: str
-    attributes: dict[str, str]
-    file: Path
-    line: int
-    children: list[Element] = field(default_factory=list)
-
-    def error(self, message: str) -> SceneError:
-        """An error at this element's line."""
-        return SceneError(message, self.file, f"line {self.line}")
-
-    def where(self) -> str:
-        """File and line, for a warning."""
-        return f"{self.file}: line {self.line}"
-
-    def attribute(self, name: str) -> str:
-        """The value of an attribute that must be there."""
-        if name not in self.attributes:
-            raise self.error(f"<{self.tag}> needs the attribute {name!r}")
-        return self.attributes[name]
-
-    def check_attributes(self, *allowed: str) -> None:
-        """Raises SceneError for an attribute that is not in `allowed`."""
-        for name in self.attributes:
-            if name not in allowed:
-                raise self.error(f"<{self.tag}> has no attribute {name!r}; {nearest(name, allowed)}")
-
-
-def nearest(name: str, allowed) -> str:
-    """The allowed names, led by the one that `name` may have meant."""
-    allowed = sorted(allowed)
-    close = difflib.get_close_matches(name, allowed, 1)
-    hint = f"did you mean {close[0]!r}? " if close else ""
-    return f"{hint}allowed: {', '.join(allowed) or 'none'}"
 
 
 def snake_case(name: str) -> str:
@@ -124,7 +85,7 @@ def parse_xml(path: Path) -> Element:
 # --- elements to plugins ---------------------------------------------------------------------------------------
 
 
-@dataclass
+@dataclass(eq=False, repr=False)
 class Plugin:
     """A Mitsuba object: its tag (``bsdf``), type (``diffuse``), properties and children. Getters note what was asked
     for, so that `finish` can report what nobody wanted."""
@@ -235,10 +196,7 @@ class Plugin:
             return None
         if element.tag != "transform":
             raise element.error(f"{name!r} must be a <transform>, not <{element.tag}>")
-        matrix = np.eye(4)
-        for step in element.children:
-            matrix = _step_matrix(step) @ matrix
-        return matrix
+        return to_matrix(element)
 
     def finish(self, *children: str) -> None:
         """Raises SceneError for a property that nobody asked for, or a child whose kind is not in `children`."""
@@ -260,7 +218,7 @@ class Plugin:
         return element.attribute("value")
 
 
-@dataclass
+@dataclass(eq=False, repr=False)
 class Document:
     """A scene with all that it includes.
 
@@ -294,7 +252,7 @@ class Document:
         for text in (name, name.replace("\\", "/")):
             for folder in (element.file.parent, *self.folders, self.path.parent):
                 if "\0" not in text and (folder / text).is_file():
-                    return (folder / text).absolute()
+                    return Path(os.path.abspath(folder / text))
         raise element.error(f"file not found: {name!r}")
 
 
@@ -366,7 +324,7 @@ class _Builder:
         elif tag == "ref":
             element.check_attributes("id", "name")
             element.attribute("id")
-            parent.children.append((self._property_name(name, parent), element))
+            self._add_child(element, parent, self._property_name(name, parent), element)
         elif tag == "include":
             self._include(element, parent)
         elif tag == "alias":
@@ -379,7 +337,7 @@ class _Builder:
         elif tag == "path":
             element.check_attributes("value")
             self.document.folders.append(element.file.parent / element.attribute("value"))
-        elif tag in _STEP_TAGS:
+        elif tag in STEP_TAGS:
             raise element.error(f"<{tag}> belongs inside a <transform>")
         else:
             known = (*OBJECT_TAGS, *PROPERTY_TAGS, *_OTHER_TAGS)
@@ -396,14 +354,22 @@ class _Builder:
         plugin = Plugin(element, tag, element.attribute("type"), element.attributes.get("id", ""), self.document)
         if plugin.id:
             self._register(plugin.id, plugin, element)
-        parent.children.append((name, plugin))
+        self._add_child(plugin, parent, name, element)
         for child in element.children:
             self.add(child, plugin)
         self._upgrade_uv(plugin)
 
+    def _add_child(self, child, parent, name, element):
+        if name:
+            self._check_new(name, parent, element)
+        parent.children.append((name, child))
+
+    def _check_new(self, name, parent, element):
+        if name in parent.properties or any(name == other for other, _ in parent.children):
+            raise element.error(f"property {name!r} of {parent.label()} is given twice")
+
     def _add_property(self, element, parent, name):
-        if name in parent.properties:
-            raise element.error(f"property {name!r} is given twice; first in line {parent.properties[name].line}")
+        self._check_new(name, parent, element)
         if element.tag == "transform":
             element.check_attributes("name")
             for step in element.children:
@@ -413,7 +379,7 @@ class _Builder:
         parent.properties[name] = element
 
     def _upgrade_uv(self, plugin):
-        """uscale, vscale, uoffset and voffset of Mitsuba 0.x as a to_uv: the offset is added first, as Mitsuba 3 does."""
+        """uscale, vscale, uoffset, voffset of Mitsuba 0.x as a to_uv: the offset is added first, as Mitsuba 3 does."""
         names = ("uoffset", "voffset", "uscale", "vscale")
         if plugin.tag != "texture" or not any(name in plugin.properties for name in names):
             return
@@ -465,85 +431,3 @@ class _Builder:
                     raise element.error(f"parameter ${name} is not defined; {nearest(name, self.values)}")
             self.used.update(name for name in parts[1::2] if name)
             element.attributes[key] = re.sub(pattern, lambda m: self.values[m[1]] if m[1] else "$", text)
-
-
-# --- values ----------------------------------------------------------------------------------------------------
-
-
-def to_number(element: Element, text: str) -> float:
-    """A finite number from text. Raises SceneError at the element."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not np.isfinite(value):
-        raise element.error(f"{text!r} is not a finite number")
-    return value
-
-
-def to_numbers(element: Element, text: str) -> list[float]:
-    """Numbers that white space or commas separate."""
-    return [to_number(element, part) for part in text.replace(",", " ").split()]
-
-
-def to_xyz(element: Element, default: float) -> tuple[float, float, float]:
-    """x, y and z from attributes of that name, or from `value` with one or three numbers."""
-    if "value" in element.attributes:
-        if any(axis in element.attributes for axis in "xyz"):
-            raise element.error(f"<{element.tag}> has either value or x, y, z")
-        numbers = to_numbers(element, element.attributes["value"])
-        if len(numbers) not in (1, 3):
-            raise element.error(f"<{element.tag}> needs one or three numbers; found {len(numbers)}")
-        return tuple(numbers * (3 // len(numbers)))
-    return tuple(to_number(element, element.attributes.get(axis, repr(default))) for axis in "xyz")
-
-
-def _step_matrix(step):
-    tag = step.tag
-    if tag == "matrix":
-        step.check_attributes("value")
-        numbers = to_numbers(step, step.attribute("value"))
-        if len(numbers) not in (9, 16):
-            raise step.error(f"<matrix> needs 9 or 16 numbers; found {len(numbers)}")
-        size = 3 if len(numbers) == 9 else 4
-        matrix = np.eye(4)
-        matrix[:size, :size] = np.reshape(numbers, (size, size))
-        return matrix
-    if tag == "lookat":
-        step.check_attributes("origin", "target", "up")
-        return _look_at(step)
-    if tag not in _STEP_TAGS:
-        raise step.error(f"<{tag}> cannot stand inside a <transform>; {nearest(tag, _STEP_TAGS)}")
-    step.check_attributes("x", "y", "z", "value", *(["angle"] if tag == "rotate" else []))
-    matrix = np.eye(4)
-    if tag == "rotate":
-        angle = to_number(step, step.attribute("angle"))
-        try:
-            return transforms.rotate(to_xyz(step, 0.0), angle)
-        except SceneError as error:
-            raise step.error(error.message) from None
-    if tag == "translate":
-        matrix[:3, 3] = to_xyz(step, 0.0)
-    else:
-        matrix[[0, 1, 2], [0, 1, 2]] = to_xyz(step, 1.0)
-    return matrix
-
-
-def _look_at(step):
-    """Mitsuba's look-at frame: +Z to the target, +X to the left of the viewer. Without up, any upright is chosen."""
-    points = []
-    for name in ("origin", "target", "up"):
-        if name == "up" and not step.attributes.get("up", "").strip():
-            points.append([0.0, 0.0, 0.0])
-            continue
-        numbers = to_numbers(step, step.attribute(name))
-        if len(numbers) != 3:
-            raise step.error(f"{name} of <lookat> needs three numbers; found {len(numbers)}")
-        points.append(numbers)
-    origin, target, up = np.array(points)
-    if not up.any():
-        up = np.eye(3)[np.argmin(np.abs(target - origin))]
-    try:
-        return transforms.look_at(origin, target, up) @ np.diag([-1.0, 1.0, -1.0, 1.0])
-    except SceneError as error:
-        raise step.error(error.message) from None

@@ -31,7 +31,10 @@ def to_matrix(transform: Transform, where: str = "") -> np.ndarray:
         for i, step in enumerate(transform):
             if not isinstance(step, TransformStep):
                 raise SceneError("matrix rows and steps cannot be mixed in one transform", path=where)
-            matrix = _step(step, f"{where}[{i}]") @ matrix
+            factor = _step(step, f"{where}[{i}]")
+            check_affine(factor, f"{where}[{i}]")
+            with np.errstate(over="ignore", invalid="ignore"):  # reported below
+                matrix = factor @ matrix
     check_affine(matrix, where)
     check_invertible(matrix, where)
     return matrix

@@ -10,11 +10,12 @@ import numpy as np
 
 from wavefront.errors import SceneError
 from wavefront.scene import description
+from wavefront.scene.ior import CONDUCTORS, INDEX_OF_REFRACTION
 from wavefront.scene.lookup import BSDF_FIELDS, NUMBER_FIELDS, TEXTURE_FIELDS, shown, unknown_name, walk
+from wavefront.scene.transforms import to_matrix
 
 MESH_SUFFIXES = (".ply", ".obj", ".gltf", ".glb")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
-_STEP_KEYS = ("translate", "rotate", "scale", "look_at", "matrix")
 _REFLECTING = ("diffuse", "conductor", "rough_conductor")
 _LARGEST = float(np.finfo(np.float32).max)
 
@@ -47,7 +48,9 @@ def validate(
         for i, shape in enumerate(scene.shapes):
             matrix = _check_transform(shape.to_world, f"shapes[{i}].to_world")
             if isinstance(shape, description.Sphere) and matrix is not None and not _is_similarity(matrix):
-                _fail(f"shapes[{i}].to_world", "a sphere can be scaled uniformly only; found different scales or a shear")
+                _fail(
+                    f"shapes[{i}].to_world", "a sphere can be scaled uniformly only; found different scales or a shear"
+                )
         _check_transform(scene.camera.to_world, "camera.to_world")
         if len(scene.emitters) > 1:
             _fail("emitters[1]", f"a scene has at most one constant environment; found {len(scene.emitters)}")
@@ -105,8 +108,6 @@ def _check_references(record, path, bsdfs, textures):
 
 
 def _check_conductor(bsdf, path):
-    from wavefront.scene.ior import CONDUCTORS
-
     given = [name for name in ("material", "eta", "k") if getattr(bsdf, name) is not None]
     if given not in (["material"], ["eta", "k"]):
         _fail(path, f"a conductor has material, or eta and k; found {' and '.join(given) if given else 'none of them'}")
@@ -115,8 +116,6 @@ def _check_conductor(bsdf, path):
 
 
 def _check_dielectric(bsdf, path):
-    from wavefront.scene.ior import INDEX_OF_REFRACTION
-
     for field in ("int_ior", "ext_ior"):
         ior = getattr(bsdf, field)
         if isinstance(ior, str) and ior not in INDEX_OF_REFRACTION:
@@ -174,7 +173,9 @@ def _check_mesh(mesh, path):
         _check_file(mesh.file, MESH_SUFFIXES, "mesh", f"{path}.file")
         return
     if "vertices" not in inline or "faces" not in inline:
-        _fail(path, f"a mesh has file, or vertices and faces; found {' and '.join(inline) if inline else 'none of them'}")
+        _fail(
+            path, f"a mesh has file, or vertices and faces; found {' and '.join(inline) if inline else 'none of them'}"
+        )
     for name in ("vertices", "faces"):
         if len(getattr(mesh, name)) == 0:
             _fail(f"{path}.{name}", "the mesh is empty")
@@ -214,64 +215,21 @@ def _check_value(value, place):
     if isinstance(value, (tuple, list)):
         for i, item in enumerate(value):
             _check_value(item, f"{place}[{i}]")
-    elif isinstance(value, float) and not abs(value) <= _LARGEST:
-        if np.isfinite(value):
-            _fail(place, f"expected a number of at most {_LARGEST:.4g}, as 32-bit floats are; found {value:g}")
-        _fail(place, f"expected a finite number; found {value}")
+    elif isinstance(value, (float, int)) and not abs(value) <= _LARGEST:
+        if value != value or abs(value) == float("inf"):
+            _fail(place, f"expected a finite number; found {value}")
+        _fail(place, f"expected a number of at most {_LARGEST:.4g}, as 32-bit floats are; found {float(value):g}")
 
 
 def _check_transform(transform, path):
     """The matrix of a transform that was found to be well-formed and invertible; None where there is none."""
-    from wavefront.scene.transforms import to_matrix
-
     if not transform:
         return None
-    rows = [not isinstance(step, description.TransformStep) for step in transform]
-    if any(rows) and not all(rows):
-        _fail(path, "rows of a matrix and steps cannot be mixed")
-    if all(rows):
-        if len(rows) != 4:
-            _fail(path, f"a matrix has 4 rows; found {len(rows)}")
-        _check_last_row(transform[3], f"{path}[3]")
-    else:
-        for i, step in enumerate(transform):
-            _check_step(step, f"{path}[{i}]")
-    with np.errstate(over="ignore", invalid="ignore"):
-        matrix = np.asarray(to_matrix(transform), dtype=np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is an error of its own
+        matrix = to_matrix(transform, path)
     if not np.all(np.abs(matrix) <= _LARGEST):
-        _fail(path, "the numbers of the transform's matrix are too large")
-    values = np.linalg.svd(matrix[:3, :3], compute_uv=False)
-    if not values[2] > 1e-12 * values[0]:
-        _fail(path, "the transform cannot be inverted: it flattens what it is applied to")
+        _fail(path, f"the transform's matrix has a number above {_LARGEST:.4g}, too large for 32-bit floats")
     return matrix
-
-
-def _check_last_row(row, path):
-    if tuple(row) != (0.0, 0.0, 0.0, 1.0):
-        _fail(path, f"the last row of a matrix is [0, 0, 0, 1]; found {list(row)}")
-
-
-def _check_step(step, path):
-    keys = [key for key in _STEP_KEYS if getattr(step, key) is not None]
-    if len(keys) != 1:
-        found = " and ".join(keys) if keys else "none of them"
-        _fail(path, f"a step has exactly one of {', '.join(_STEP_KEYS)}; found {found}")
-    if step.matrix is not None:
-        _check_last_row(step.matrix[3], f"{path}.matrix[3]")
-    elif step.scale is not None and not np.all(step.scale):
-        _fail(f"{path}.scale", "a scale of 0 cannot be inverted")
-    elif step.rotate is not None and not any(step.rotate.axis):
-        _fail(f"{path}.rotate.axis", "the axis has no direction; found [0, 0, 0]")
-    elif step.look_at is not None:
-        look_at = step.look_at
-        forward = np.subtract(look_at.target, look_at.origin)
-        if not forward.any():
-            _fail(f"{path}.look_at.target", f"target is the same point as origin; found {list(look_at.target)}")
-        if not any(look_at.up):
-            _fail(f"{path}.look_at.up", "up has no direction; found [0, 0, 0]")
-        sine = np.linalg.norm(np.cross(forward / np.abs(forward).max(), look_at.up / np.abs(look_at.up).max()))
-        if sine < 1e-6:
-            _fail(f"{path}.look_at.up", f"up is parallel to the direction of view; found {list(look_at.up)}")
 
 
 def _is_similarity(matrix):

@@ -1,0 +1,108 @@
+"""The converter: what it writes says the same as what it read, and an error leaves nothing behind."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tools import convert
+from wavefront.scene import description as d
+from wavefront.scene import load_scene, meshes
+from wavefront.scene.mitsuba import UNLIMITED_DEPTH
+
+OBJ = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0.5\nvt 0.1 0.2\nvt 0.9 0.2\nvt 0.9 0.8\nf 1/1 2/2 3/3\nf 1/1 3/3 4/2\n"
+SCENE = """<scene version="3.0.0">
+<integrator type="path"><integer name="max_depth" value="$depth"/></integrator>
+<default name="unused" value="1"/>
+<sensor type="perspective"><float name="fov" value="40"/></sensor>
+<bsdf type="twosided" id="board"><bsdf type="diffuse"><texture type="bitmap" name="reflectance">
+  <string name="filename" value="{texture}"/></texture></bsdf></bsdf>
+<shape type="obj"><string name="filename" value="a/mesh.obj"/><ref id="board"/>
+  <transform name="to_world"><scale x="-1" y="2"/></transform></shape>
+<shape type="obj"><string name="filename" value="b/mesh.obj"/><boolean name="flip_tex_coords" value="false"/></shape>
+<shape type="obj"><string name="filename" value="a/mesh.obj"/><boolean name="face_normals" value="true"/></shape>
+<shape type="obj"><string name="filename" value="a/mesh.obj"/><ref id="board"/></shape>
+<shape type="sphere"><emitter type="area"/></shape>
+</scene>
+"""
+
+
+@pytest.fixture
+def scene_file(tmp_path):
+    for name, text in (("a", OBJ), ("b", OBJ.replace("0.5", "0.25") + "vn 0 0 1\n")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "mesh.obj").write_text(text)
+    Image.fromarray(np.full((2, 2, 3), 80, np.uint8)).save(tmp_path / "a" / "t.png")
+    path = tmp_path / "scene.xml"
+    path.write_text(SCENE.replace("$depth", "5").replace("{texture}", "a/t.png"))
+    return path
+
+
+def test_converted_scene_is_the_same_scene(scene_file, tmp_path, capsys):
+    (tmp_path / "out").mkdir()
+    out = tmp_path / "out" / "room.json"
+    assert convert.main([str(scene_file), str(out)]) == 0
+    assert capsys.readouterr().err == ""
+    names = sorted(str(path.relative_to(out.parent)) for path in out.parent.rglob("*") if path.is_file())
+    assert names == ["room.json"] + [f"room_meshes/mesh{i}.ply" for i in ("", "_2", "_3")] + ["room_textures/t.png"]
+    assert str(tmp_path) not in out.read_text()
+    first, second = load_scene(scene_file, warn=lambda message: None), load_scene(out)
+    assert second.integrator == first.integrator
+    assert second.camera == first.camera
+    assert [bsdf.name for bsdf in second.bsdfs] == ["board"]
+    assert len(second.shapes) == len(first.shapes)
+    for before, after in zip(first.shapes, second.shapes, strict=True):
+        assert (after.bsdf, after.emitter) == (before.bsdf, before.emitter)
+        if isinstance(before, d.Sphere):
+            continue
+        a, b = meshes.tessellate(before), meshes.tessellate(after)
+        np.testing.assert_array_equal(a.faces, b.faces)
+        np.testing.assert_allclose(a.vertices, b.vertices, atol=1e-6)
+        np.testing.assert_allclose(a.uvs, b.uvs, atol=1e-6)
+        assert (a.normals is None) == (b.normals is None)
+        if a.normals is not None:
+            np.testing.assert_allclose(a.normals, b.normals, atol=1e-6)
+
+
+def test_converting_again_replaces_the_folders(scene_file, tmp_path):
+    out = tmp_path / "room.json"
+    convert.main([str(scene_file), str(out), "--quiet"])
+    before = out.read_bytes()
+    (tmp_path / "room_meshes" / "left over").write_text("x")
+    assert convert.main([str(out), str(out), "--quiet"]) == 0
+    assert out.read_bytes() == before
+    assert not (tmp_path / "room_meshes" / "left over").exists()
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+@pytest.mark.parametrize(
+    ("change", "arguments", "words"),
+    [
+        (("", ""), ["missing.xml", "out.json"], "file not found"),
+        (("", ""), ["scene.xml", "out.txt"], "must end in .json"),
+        (("", ""), ["scene.xml", "out.json", "-D", "depth"], "expected NAME=VALUE"),
+        (("", ""), ["scene.xml", "no/out.json"], "cannot be written"),
+        (('type="sphere"', 'type="cylinder"'), ["scene.xml", "out.json"], "line 12: shape 'cylinder' is not supported"),
+        (("a/t.png", "a/no.png"), ["scene.xml", "out.json"], "file not found"),
+        (("a/mesh.obj", "a/broken.obj"), ["scene.xml", "out.json"], "index out of range"),
+    ],
+)
+def test_errors_are_one_line_and_leave_nothing(scene_file, tmp_path, capsys, monkeypatch, change, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a" / "broken.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n")
+    scene_file.write_text(scene_file.read_text().replace(*change))
+    before = sorted(path.name for path in tmp_path.iterdir())
+    assert convert.main(arguments) == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_parameters(scene_file, tmp_path):
+    text = scene_file.read_text().replace('value="5"', 'value="$depth"')
+    scene_file.write_text(text.replace('<default name="unused" value="1"/>', ""))
+    out = tmp_path / "out.json"
+    assert convert.main([str(scene_file), str(out)]) == 2
+    assert convert.main([str(scene_file), str(out), "--quiet", "-D", "depth=-1"]) == 0
+    assert load_scene(out).integrator.max_depth == UNLIMITED_DEPTH

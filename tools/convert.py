@@ -1,0 +1,139 @@
+"""Converts a scene to our JSON format: ``python -m tools.convert scene.xml out.json``.
+
+Meshes are written as binary PLY to ``<out>_meshes/`` and textures are copied to ``<out>_textures/``, both beside the
+JSON file, which refers to them by relative path. Everything is written under temporary names first, and the JSON file
+is put in place last, so that an error leaves nothing half-written.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import secrets
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from wavefront.errors import SceneError, WavefrontError
+from wavefront.scene import description, json_format, load_scene, meshes
+from wavefront.scene.images import replacing
+from wavefront.scene.lookup import walk
+
+
+def convert(scene: description.Scene, out: str | os.PathLike) -> None:
+    """Writes `scene` (file paths absolute) as JSON with its meshes and textures beside it. `scene` is not changed.
+
+    Raises:
+        WavefrontError: A mesh or texture is missing or not readable, or the output cannot be written.
+    """
+    out = Path(out)
+    names = {kind: f"{out.stem}_{kind}" for kind in ("meshes", "textures")}
+    mark = secrets.token_hex(4)
+    staged = {kind: out.parent / f".{name}.{mark}.tmp" for kind, name in names.items()}
+    scene = json_format.checked(scene)  # a copy
+    try:
+        _write_meshes(scene, staged["meshes"], out.parent / names["meshes"])
+        _copy_textures(scene, staged["textures"], out.parent / names["textures"])
+        with replacing(out) as temporary:
+            temporary.write_text(json_format.dumps(scene, out.parent), encoding="utf-8")
+            for kind, folder in staged.items():
+                _replace_folder(folder, out.parent / names[kind], mark)
+    except OSError as error:
+        raise WavefrontError(f"{error.filename or out}: cannot be written: {error.strerror or error}") from None
+    finally:
+        meshes.clear_cache()
+        for folder in staged.values():
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _write_meshes(scene, folder, final):
+    """Writes every mesh that comes from a file as PLY in its own space; shapes that share a file share the PLY."""
+    written: dict[tuple, tuple[Path, bool]] = {}
+    taken: set[str] = set()
+    for i, shape in enumerate(scene.shapes):
+        if not isinstance(shape, description.Mesh) or shape.file is None:
+            continue
+        key = (shape.file, shape.face_normals, shape.flip_v)
+        if key not in written:
+            folder.mkdir(exist_ok=True)
+            name = _free_name(Path(shape.file).stem, ".ply", taken)
+            plain = description.Mesh(file=shape.file, face_normals=shape.face_normals, flip_v=shape.flip_v)
+            mesh = meshes.tessellate(plain, f"shapes[{i}]")
+            meshes.write_ply(folder / name, mesh)
+            written[key] = final / name, mesh.normals is not None
+        path, has_normals = written[key]
+        shape.file, shape.flip_v = str(path), None
+        # computed normals stay with the reader: they depend on to_world, under which angles change
+        shape.smooth_normals = shape.smooth_normals and not has_normals
+
+
+def _copy_textures(scene, folder, final):
+    copied: dict[str, Path] = {}
+    taken: set[str] = set()
+    for path, record in walk(scene):
+        if not isinstance(record, description.Bitmap):
+            continue
+        if record.file not in copied:
+            folder.mkdir(exist_ok=True)
+            source = Path(record.file)
+            name = _free_name(source.stem, source.suffix, taken)
+            try:
+                shutil.copyfile(source, folder / name)
+            except FileNotFoundError:
+                raise SceneError(f"{source}: file not found", path=f"{path}.file") from None
+            copied[record.file] = final / name
+        record.file = str(copied[record.file])
+
+
+def _free_name(stem, suffix, taken):
+    """A file name that is not in `taken`, also where upper and lower case are the same; adds it there."""
+    name, number = stem + suffix, 1
+    while name.lower() in taken:
+        number += 1
+        name = f"{stem}_{number}{suffix}"
+    taken.add(name.lower())
+    return name
+
+
+def _replace_folder(new, final, mark):
+    """Puts the folder `new`, if there is one, in the place of `final`."""
+    if not new.exists():
+        return
+    old = final.with_name(f".{final.name}.{mark}.old")
+    if final.exists():
+        os.replace(final, old)
+    os.replace(new, final)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command. Returns its exit code: 0, or 2 after an error, of which one line is printed."""
+    parser = argparse.ArgumentParser(prog="python -m tools.convert", description=__doc__.split("\n\n")[0])
+    parser.add_argument("scene", help="the scene to convert: Mitsuba XML, or our JSON")
+    parser.add_argument("out", help="the JSON file to write")
+    parser.add_argument("-D", dest="parameters", action="append", default=[], metavar="NAME=VALUE",
+                        help="a value for $NAME in a Mitsuba scene; may be repeated")  # fmt: skip
+    parser.add_argument("--quiet", action="store_true", help="print no warnings")
+    options = parser.parse_args(arguments)
+    try:
+        if Path(options.out).suffix.lower() != ".json":
+            raise WavefrontError(f"{options.out}: the output must end in .json")
+        bad = next((text for text in options.parameters if "=" not in text), None)
+        if bad is not None:
+            raise WavefrontError(f"-D {bad}: expected NAME=VALUE")
+        parameters = dict(text.split("=", 1) for text in options.parameters)
+        warn = (lambda message: None) if options.quiet else _print_warning
+        convert(load_scene(options.scene, parameters=parameters, warn=warn), options.out)
+    except WavefrontError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _print_warning(message):
+    print(f"warning: {message}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,339 @@
+"""Mitsuba XML scenes (dialects 0.5, 0.6, 2 and 3) to scene records.
+
+What the records cannot say is an error that names the element and its line; what does not change the image is a warning
+or is left out. Where the dialects differ in meaning, Mitsuba 3.9 decides: it is what images are compared with.
+
+Choices: unlimited `max_depth` (-1) becomes 1000. Integrators that compute the same image another way (bdpt, sppm, ...)
+become `path` with a warning, and `direct` becomes `path` of depth 2. Filters that the records lack become a Gaussian.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from wavefront.errors import SceneError
+from wavefront.scene import description, transforms
+from wavefront.scene.meshes import has_file_normals
+from wavefront.scene.mitsuba_materials import Materials
+from wavefront.scene.mitsuba_xml import Document, Plugin, read
+
+UNLIMITED_DEPTH = 1000
+# Mitsuba's camera looks along +Z with +X to the left; ours along -Z with +X to the right.
+CAMERA_FRAME = np.diag([-1.0, 1.0, -1.0, 1.0])
+_DIAGONAL_35MM = 43.266615300557  # millimetres: the film that a focal length refers to
+
+_INTEGRATORS_OF_ANOTHER_IMAGE = ("ao", "aov", "depth", "field", "irrcache", "moment", "multichannel", "stokes", "vaov")
+_NESTED = ("bsdf", "emitter")
+
+
+def load(
+    path: str | os.PathLike,
+    warn: Callable[[str], object] | None = None,
+    parameters: Mapping[str, object] | None = None,
+) -> description.Scene:
+    """Reads a Mitsuba scene.
+
+    Args:
+        path: The XML file.
+        warn: Called with a line of text for each warning; default: `warnings.warn`.
+        parameters: Values for ``$name`` in the file; they win over its defaults.
+
+    Returns:
+        The scene; file paths are absolute. Mesh and image files are known to exist, but are not read.
+
+    Raises:
+        SceneError: With file and line: bad XML, a missing file, anything that is not supported.
+    """
+    if warn is None:
+        warn = _default_warn
+    document = read(Path(path), parameters or {})
+    return _Importer(document, warn).scene()
+
+
+def _default_warn(message):
+    warnings.warn(message, stacklevel=3)
+
+
+class _Importer:
+    def __init__(self, document: Document, warn: Callable[[str], object]):
+        self.document, self.warn = document, warn
+        self.materials = Materials(document, warn)
+
+    def scene(self):
+        root = self.document.scene
+        if self.document.version >= (4,):
+            self.warn(f"{root.where()}: version {root.element.attributes['version']} is read as version 3")
+        groups: dict[str, list[Plugin]] = {}
+        for _, plugin in root.children:
+            if isinstance(plugin, Plugin):
+                groups.setdefault(plugin.tag, []).append(plugin)
+        for tag in groups:
+            if tag not in ("bsdf", "texture", "shape", "emitter", "sensor", "integrator", "medium", "sampler", "film"):
+                raise groups[tag][0].error(f"{groups[tag][0].label()} is not supported at the top level of a scene")
+        root.finish(*groups)
+        if len(groups.get("integrator", [])) > 1:
+            raise groups["integrator"][1].error("a scene has one integrator")
+        camera, film, spp = self._sensor(groups.get("sensor", []))
+        integrator = self._integrator(groups.get("integrator", [None])[0], spp)
+        shapes = [self._shape(plugin) for plugin in groups.get("shape", [])]
+        emitters = [self._emitter(plugin) for plugin in groups.get("emitter", [])]
+        self.materials.unused()
+        return description.Scene(
+            shapes=shapes,
+            camera=camera,
+            film=film,
+            integrator=integrator,
+            textures=self.materials.records("texture"),
+            bsdfs=self.materials.records("bsdf"),
+            emitters=emitters,
+        )
+
+    # --- sensor, film, integrator --------------------------------------------------------------------------------
+
+    def _sensor(self, sensors):
+        if not sensors:
+            raise self.document.scene.error("the scene has no sensor")
+        if len(sensors) > 1:
+            self.warn(f"{sensors[1].where()}: the scene has {len(sensors)} sensors; the first is used")
+        plugin = sensors[0]
+        if plugin.type != "perspective":
+            raise plugin.error(f"{plugin.label()} is not supported; supported: perspective")
+        axis = plugin.string("fov_axis", "x", ("x", "y", "diagonal", "smaller", "larger"))
+        fov = plugin.number("fov")
+        if fov is None:
+            axis, fov = "diagonal", self._focal_fov(plugin)
+        elif plugin.has("focal_length"):
+            raise plugin.error("a sensor has either fov or focal_length")
+        if not 0.0 < fov < 180.0:
+            raise plugin.error(f"fov must be between 0 and 180 degrees; found {fov:g}")
+        for name in ("principal_point_offset_x", "principal_point_offset_y"):
+            if plugin.number(name, 0.0) != 0.0:
+                raise plugin.get(name).error(f"{name} is not supported")
+        for name in ("near_clip", "far_clip"):
+            if plugin.get(name) is not None:
+                self.warn(f"{plugin.get(name).where()}: {name} is left out; nothing is clipped")
+        plugin.ignore("focus_distance", "shutter_open", "shutter_close", "near_clip", "far_clip")
+        matrix = self._matrix(plugin)
+        camera = description.Perspective(fov=fov, fov_axis=axis, to_world=_rows(matrix @ CAMERA_FRAME))
+        spp = self._sampler(plugin)
+        film = self._film(plugin)
+        plugin.finish("film", "sampler")
+        return camera, film, spp
+
+    def _focal_fov(self, plugin):
+        text = plugin.string("focal_length", "50mm").strip()
+        number = text.removesuffix("mm")
+        try:
+            focal = float(number)
+        except ValueError:
+            focal = -1.0
+        if not (focal > 0.0 and math.isfinite(focal)):
+            raise plugin.get("focal_length").error(f"focal_length {text!r} is not a length such as 50mm")
+        return math.degrees(2.0 * math.atan(_DIAGONAL_35MM / (2.0 * focal)))
+
+    def _sampler(self, sensor):
+        samplers = sensor.objects("sampler")
+        if not samplers:
+            return 4
+        sampler = samplers[0]
+        spp = sampler.integer("sample_count", 4)
+        if not 1 <= spp < 2**31:
+            raise sampler.error(f"sample_count must be at least 1; found {spp}")
+        if sampler.type != "independent":
+            self.warn(f"{sampler.where()}: {sampler.label()} is taken as 'independent'")
+            sampler.ignore(*sampler.properties)
+        sampler.ignore("seed", "jitter")
+        sampler.finish()
+        return spp
+
+    def _film(self, sensor):
+        films = sensor.objects("film")
+        if not films:
+            return description.Film(width=768, height=576, filter=description.GaussianFilter())
+        film = films[0]
+        if film.type not in ("hdrfilm", "ldrfilm"):
+            raise film.error(f"{film.label()} is not supported; supported: hdrfilm, ldrfilm")
+        width, height = film.integer("width", 768), film.integer("height", 576)
+        for name, value in (("width", width), ("height", height)):
+            if not 1 <= value <= 65536:
+                raise film.get(name).error(f"{name} must be from 1 to 65536; found {value}")
+        for name, whole in (
+            ("crop_offset_x", 0), ("crop_offset_y", 0), ("crop_width", width), ("crop_height", height),
+        ):  # fmt: skip
+            if film.integer(name, whole) != whole:
+                raise film.get(name).error("a crop window is not supported")
+        # how the file is written, not what is in the image
+        film.ignore(
+            "file_format", "pixel_format", "component_format", "banner", "gamma", "exposure", "tonemap_method", "key",
+            "burn", "high_quality_edges", "attach_log", "compensate", "sample_border", "channel_names",
+        )  # fmt: skip
+        filters = film.objects("rfilter")
+        record = self._filter(filters[0]) if filters else description.GaussianFilter()
+        film.finish("rfilter")
+        return description.Film(width=width, height=height, filter=record)
+
+    def _filter(self, plugin):
+        if plugin.type == "box":
+            if plugin.number("radius", 0.5) != 0.5:
+                raise plugin.get("radius").error("a box filter of another radius than 0.5 is not supported")
+            record = description.BoxFilter()
+        elif plugin.type == "tent":
+            record = description.TentFilter(radius=self._positive(plugin, "radius", 1.0))
+        elif plugin.type == "gaussian":
+            record = description.GaussianFilter(stddev=self._positive(plugin, "stddev", 0.5))
+        else:
+            self.warn(f"{plugin.where()}: {plugin.label()} is not supported; a Gaussian filter is used")
+            return description.GaussianFilter()
+        plugin.finish()
+        return record
+
+    def _positive(self, plugin, name, default):
+        value = plugin.number(name, default)
+        if not value > 0.0:
+            raise plugin.get(name).error(f"{name} must be greater than 0; found {value:g}")
+        return value
+
+    def _integrator(self, plugin, spp):
+        if plugin is None:
+            self.warn(f"{self.document.path}: the scene has no integrator; 'path' of depth {UNLIMITED_DEPTH} is used")
+            return description.PathIntegrator(max_depth=UNLIMITED_DEPTH, spp=spp)
+        if plugin.type in _INTEGRATORS_OF_ANOTHER_IMAGE:
+            raise plugin.error(f"{plugin.label()} is not supported; supported: path, direct")
+        if plugin.type == "direct":
+            plugin.ignore("shading_samples", "emitter_samples", "bsdf_samples")
+            max_depth, rr_depth = 2, None
+        else:
+            max_depth, rr_depth = plugin.integer("max_depth", -1), plugin.integer("rr_depth", 5)
+        if plugin.boolean("hide_emitters"):
+            raise plugin.get("hide_emitters").error("hide_emitters is not supported")
+        if plugin.boolean("strict_normals"):
+            raise plugin.get("strict_normals").error("strict_normals is not supported")
+        plugin.ignore("samples_per_pass", "block_size", "timeout")
+        if plugin.type in ("path", "direct"):
+            plugin.finish()
+        else:
+            self.warn(f"{plugin.where()}: {plugin.label()} is taken as 'path'")
+        if max_depth == -1:
+            self.warn(f"{plugin.where()}: unlimited max_depth is taken as {UNLIMITED_DEPTH}")
+            max_depth = UNLIMITED_DEPTH
+        if not 1 <= max_depth <= 1_000_000:
+            raise plugin.get("max_depth").error(f"max_depth must be -1 or from 1 to 1000000; found {max_depth}")
+        if rr_depth is not None and rr_depth < 1:
+            raise plugin.get("rr_depth").error(f"rr_depth must be at least 1; found {rr_depth}")
+        return description.PathIntegrator(max_depth=max_depth, rr_depth=rr_depth, spp=spp)
+
+    # --- emitters and shapes -------------------------------------------------------------------------------------
+
+    def _emitter(self, plugin):
+        if plugin.type != "constant":
+            if plugin.type == "area":
+                raise plugin.error(f"{plugin.label()} belongs inside a shape")
+            raise plugin.error(f"{plugin.label()} is not supported; supported: area, constant")
+        radiance = self.materials.colour(plugin, "radiance", 1.0, emitted=True)
+        if not isinstance(radiance, (float, list)):
+            raise plugin.error("the radiance of a constant emitter must be a colour, not a texture")
+        plugin.ignore("sampling_weight")
+        plugin.finish()
+        return description.Constant(radiance=radiance, name=plugin.id)
+
+    def _area(self, plugin):
+        if plugin.type != "area":
+            raise plugin.error(f"{plugin.label()} is not supported inside a shape; supported: area")
+        record = description.Area(radiance=self.materials.colour(plugin, "radiance", 1.0, emitted=True))
+        plugin.ignore("sampling_weight")
+        plugin.finish("texture")
+        return record
+
+    def _shape(self, plugin):
+        kinds = {
+            "obj": self._mesh,
+            "ply": self._mesh,
+            "rectangle": self._primitive(description.Rectangle),
+            "cube": self._primitive(description.Cube),
+            "disk": self._primitive(description.Disk),
+            "sphere": self._sphere,
+        }
+        if plugin.type not in kinds:
+            raise plugin.error(f"{plugin.label()} is not supported; supported: {', '.join(kinds)}")
+        common = {"name": plugin.id, "flip_normals": plugin.boolean("flip_normals")}
+        matrix = self._matrix(plugin)
+        if not np.array_equal(matrix, np.eye(4)):
+            common["to_world"] = _rows(matrix)
+        bsdfs, emitters = plugin.objects("bsdf"), plugin.objects("emitter")
+        for found in (bsdfs, emitters):
+            if len(found) > 1:
+                raise found[1].error(f"a shape has one {found[1].tag}; found {len(found)}")
+        if emitters:
+            common["emitter"] = self._area(emitters[0])
+            # an emitter without a BSDF reflects nothing in Mitsuba 3
+            common["bsdf"] = description.Diffuse(reflectance=0.0)
+        if bsdfs:
+            common["bsdf"] = self.materials.bsdf(bsdfs[0])
+        record = kinds[plugin.type](plugin, common, transforms.is_mirror(matrix))
+        for name, child in plugin.resolved():
+            if child.tag == "medium" or name in ("interior", "exterior"):
+                raise child.error(f"participating media are not supported ({name or 'medium'} of {plugin.label()})")
+        plugin.finish(*_NESTED)
+        return record
+
+    def _primitive(self, record):
+        def convert(plugin, common, mirrored):
+            plugin.ignore("face_normals")  # they are flat
+            return record(**common)
+
+        return convert
+
+    def _sphere(self, plugin, common, mirrored):
+        radius = self._positive(plugin, "radius", 1.0)
+        center = plugin.vector("center", (0.0, 0.0, 0.0))
+        # under a mirroring transform Mitsuba turns a sphere inside out; our records do not
+        common["flip_normals"] ^= mirrored
+        return description.Sphere(radius=radius, center=center, **common)
+
+    def _mesh(self, plugin, common, mirrored):
+        element = plugin.get("filename")
+        if element is None:
+            raise plugin.error(f"{plugin.label()} needs a filename")
+        file = self.document.find(plugin.string("filename", ""), element)
+        flat = plugin.boolean("face_normals")
+        flip_v = plugin.boolean("flip_tex_coords", plugin.type == "obj")
+        plugin.ignore("collapse", "srgb")
+        for name in ("max_smooth_angle", "shape_index"):
+            if plugin.get(name) is not None:
+                raise plugin.get(name).error(f"{name} is not supported")
+        is_obj = file.suffix.lower() == ".obj"
+        if is_obj != (plugin.type == "obj") or file.suffix.lower() not in (".obj", ".ply"):
+            raise element.error(f"{plugin.label()} needs a .{plugin.type} file; found {file.name!r}")
+        if mirrored and (flat or not has_file_normals(str(file), f"line {element.line}")):
+            # there the winding decides which side is outside, and mirroring turns it; our records keep the side
+            common["flip_normals"] ^= True
+        return description.Mesh(
+            file=str(file),
+            face_normals=flat,
+            smooth_normals=not flat,
+            flip_v=None if flip_v == is_obj else flip_v,
+            **common,
+        )
+
+    def _matrix(self, plugin):
+        """The (4, 4) to_world of a plugin."""
+        matrix = plugin.transform("to_world")
+        if matrix is None:
+            return np.eye(4)
+        element = plugin.get("to_world")
+        try:
+            transforms.check_affine(matrix)
+            transforms.check_invertible(matrix)
+        except SceneError as error:
+            raise element.error(error.message) from None
+        return matrix
+
+
+def _rows(matrix):
+    return [tuple(float(value) + 0.0 for value in row) for row in matrix]  # + 0.0: no minus zeros

@@ -1,0 +1,361 @@
+"""Mitsuba BSDFs, textures and colours to records. Defaults are those of Mitsuba 3.9, whatever the dialect."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from wavefront.errors import SceneError
+from wavefront.scene import description
+from wavefront.scene.mitsuba_values import Element, to_number, to_numbers
+from wavefront.scene.mitsuba_xml import Document, Plugin
+
+SMOOTHEST = 1e-4  # alpha of the roughest surface that is taken as smooth, exclusive
+
+# A constant spectrum that is emitted is equal-energy white, not D65: XYZ (1, 1, 1) in linear Rec. 709 (IEC 61966-2-1).
+EQUAL_ENERGY = (1.204794, 0.948291, 0.908916)
+
+_LDR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tga")
+
+
+@dataclass
+class Materials:
+    """Converts BSDFs and textures of a document; those at the top level with an id become named records.
+
+    Attributes:
+        document: Where they come from.
+        warn: Called with a line of text for what does not change the image.
+        used: Named BSDFs and textures that something refers to, by id.
+    """
+
+    document: Document
+    warn: Callable[[str], object]
+    used: dict[str, object] = field(default_factory=dict)
+
+    def __post_init__(self):
+        top = (plugin for _, plugin in self.document.scene.children if isinstance(plugin, Plugin))
+        self.named = {plugin.id: plugin for plugin in top if plugin.id and plugin.tag in ("bsdf", "texture")}
+        self._bsdfs = {
+            "diffuse": self._diffuse,
+            "conductor": self._conductor,
+            "roughconductor": self._conductor,
+            "dielectric": self._dielectric,
+            "roughdielectric": self._dielectric,
+            "twosided": self._twosided,
+            "mask": self._mask,
+            "null": self._null,
+        }
+
+    def unused(self) -> None:
+        """Converts the named records that nothing refers to; what is wrong with them is a warning."""
+        for name, plugin in self.named.items():
+            if name in self.used:
+                continue
+            try:
+                self._named(plugin, self._convert_texture if plugin.tag == "texture" else self._convert_bsdf)
+            except SceneError as error:
+                self.warn(f"{plugin.where()}: {plugin.tag} {name!r} is left out, nothing uses it: {error.message}")
+
+    def records(self, tag: str) -> list:
+        """The named records of a kind (``bsdf`` or ``texture``), in file order."""
+        return [self.used[name] for name, plugin in self.named.items() if plugin.tag == tag and name in self.used]
+
+    # --- BSDFs -------------------------------------------------------------------------------------------------
+
+    def bsdf(self, plugin: Plugin) -> str | description.Bsdf:
+        """The record of a BSDF, or its name if it stands at the top level with an id.
+
+        Raises:
+            SceneError: With file and line: a kind, a property or a value that is not supported.
+        """
+        if self.named.get(plugin.id) is plugin:
+            self._named(plugin, self._convert_bsdf)
+            return plugin.id
+        return self._convert_bsdf(plugin)
+
+    def _named(self, plugin, convert):
+        if plugin.id not in self.used:
+            record = convert(plugin)
+            record.name = plugin.id
+            self.used[plugin.id] = record
+
+    def _convert_bsdf(self, plugin):
+        if plugin.type not in self._bsdfs:
+            yet = " yet" if plugin.type in ("bumpmap", "normalmap") else ""
+            raise plugin.error(f"{plugin.label()} is not supported{yet}; supported: {', '.join(self._bsdfs)}")
+        return self._bsdfs[plugin.type](plugin)
+
+    def _diffuse(self, plugin):
+        record = description.Diffuse(reflectance=self.colour(plugin, "reflectance", 0.5, limit=1.0))
+        plugin.finish("texture")
+        return record
+
+    def _conductor(self, plugin):
+        fields = self._conductor_spectrum(plugin)
+        fields["specular_reflectance"] = self.colour(plugin, "specular_reflectance", 1.0, limit=1.0)
+        if plugin.type == "roughconductor":
+            fields |= self._roughness(plugin)
+        plugin.finish("texture")
+        if "alpha" in fields and _is_smooth(fields["alpha"]):
+            del fields["alpha"], fields["distribution"]
+        return (description.RoughConductor if "alpha" in fields else description.Conductor)(**fields)
+
+    def _conductor_spectrum(self, plugin):
+        material = plugin.string("material", "")
+        given = plugin.has("eta") or plugin.has("k")
+        if material and given:
+            raise plugin.error(f"{plugin.label()} has either material or eta and k")
+        exterior = self._ior(plugin, "ext_eta", 1.0)
+        if exterior != 1.0 and not isinstance(exterior, str) and not material and given:
+            scale = 1.0 / exterior  # Mitsuba 0.x: relative to the medium outside
+        elif exterior in (1.0, "air", "vacuum"):
+            scale = 1.0
+        else:
+            raise plugin.error(f"ext_eta is supported as a number beside eta and k, not as {exterior!r}")
+        if material and material != "none":
+            return {"material": material}
+        if not material and not given and self.document.version < (2,):
+            self.warn(f"{plugin.where()}: {plugin.label()} without a material is a perfect mirror, as in Mitsuba 3")
+        return {
+            "eta": _scaled(plugin, self.colour(plugin, "eta", 0.0), scale),
+            "k": _scaled(plugin, self.colour(plugin, "k", 1.0), scale),
+        }
+
+    def _dielectric(self, plugin):
+        fields = {}
+        for name, default in (("int_ior", 1.5046), ("ext_ior", 1.000277)):
+            fields[name] = self._ior(plugin, name, default)
+        for name in ("specular_reflectance", "specular_transmittance"):
+            fields[name] = self.colour(plugin, name, 1.0, limit=1.0)
+        if plugin.type == "roughdielectric":
+            fields |= self._roughness(plugin)
+        plugin.finish("texture")
+        if "alpha" in fields and _is_smooth(fields["alpha"]):
+            del fields["alpha"], fields["distribution"]
+        return (description.RoughDielectric if "alpha" in fields else description.Dielectric)(**fields)
+
+    def _ior(self, plugin, name, default):
+        element = plugin.get(name)
+        if element is None:
+            return default
+        if element.tag == "string":
+            # Mitsuba 0.x also took the number as a string
+            text = plugin.string(name, "")
+            try:
+                value = float(text)
+            except ValueError:
+                return text
+        else:
+            value = plugin.number(name)
+        if not value > 0.0:
+            raise element.error(f"{name} must be greater than 0; found {value:g}")
+        return value
+
+    def _roughness(self, plugin):
+        distribution = plugin.string("distribution", "beckmann", ("beckmann", "ggx"))
+        plugin.ignore("sample_visible")
+        directions = [name for name in ("alpha_u", "alpha_v") if plugin.has(name)]
+        if directions:
+            if plugin.has("alpha"):
+                raise plugin.error("alpha excludes alpha_u and alpha_v")
+            first, second = (self.scalar(plugin, name, 0.1) for name in ("alpha_u", "alpha_v"))
+            if first != second:
+                raise plugin.error("anisotropic roughness is not supported; alpha_u and alpha_v must be equal")
+            alpha = first
+        else:
+            alpha = self.scalar(plugin, "alpha", 0.1)
+        if isinstance(alpha, float) and alpha > 1.0:
+            raise plugin.error(f"alpha must be at most 1; found {alpha:g}")
+        return {"alpha": alpha, "distribution": distribution}
+
+    def _twosided(self, plugin):
+        sides = plugin.objects("bsdf")
+        plugin.finish("bsdf")
+        if len(sides) not in (1, 2):
+            raise plugin.error(f"{plugin.label()} needs one or two BSDFs; found {len(sides)}")
+        return description.TwoSided(front=self.bsdf(sides[0]), back=self.bsdf(sides[1]) if len(sides) == 2 else None)
+
+    def _mask(self, plugin):
+        opacity = self.scalar(plugin, "opacity", 0.5, limit=1.0)
+        nested = plugin.objects("bsdf")
+        plugin.finish("bsdf", "texture")
+        if len(nested) != 1:
+            raise plugin.error(f"{plugin.label()} needs one BSDF; found {len(nested)}")
+        return description.Mask(opacity=opacity, bsdf=self.bsdf(nested[0]))
+
+    def _null(self, plugin):
+        plugin.finish()
+        # a surface that is not there: light passes, and it can still emit
+        return description.Mask(opacity=0.0, bsdf=description.Diffuse(reflectance=0.0))
+
+    # --- colours and textures ----------------------------------------------------------------------------------
+
+    def colour(self, plugin: Plugin, name: str, default, limit: float | None = None, emitted: bool = False):
+        """A grey value, a list of three, the name of a texture, or a texture.
+
+        Args:
+            plugin: What has the property.
+            name: The property.
+            default: Where it is not given.
+            limit: The largest value allowed.
+            emitted: It is a radiance: a constant spectrum is then equal-energy white.
+        """
+        texture = plugin.child(name)
+        if texture is not None:
+            return self._texture(texture, False, limit)
+        element = plugin.get(name)
+        return default if element is None else colour_value(element, limit, emitted)
+
+    def scalar(self, plugin: Plugin, name: str, default: float, limit: float | None = None):
+        """A number, the name of a texture, or a texture, for a parameter that is not a colour."""
+        texture = plugin.child(name)
+        if texture is not None:
+            return self._texture(texture, True, limit)
+        element = plugin.get(name)
+        if element is None:
+            return default
+        value = colour_value(element, limit)
+        if isinstance(value, list):
+            if len(set(value)) > 1:
+                raise element.error(f"{name!r} must be one number, not a colour")
+            value = value[0]
+        return value
+
+    def _texture(self, plugin, scalar, limit):
+        if plugin.type == "uniform":
+            element = plugin.get("value")
+            plugin.finish()
+            return 1.0 if element is None else colour_value(element, limit)
+        if not scalar and self.named.get(plugin.id) is plugin:
+            self._named(plugin, self._convert_texture)
+            return plugin.id
+        # a named texture is encoded as a colour; where a number is wanted, a copy says how it is encoded there
+        return self._convert_texture(plugin, scalar)
+
+    def _convert_texture(self, plugin, scalar=False):
+        if plugin.tag != "texture":
+            raise plugin.error(f"{plugin.label()} cannot be used as a texture")
+        if plugin.type == "bitmap":
+            return self._bitmap(plugin, scalar)
+        if plugin.type == "checkerboard":
+            colours = {name: self.colour(plugin, name, value) for name, value in (("color0", 0.4), ("color1", 0.2))}
+            for name, value in colours.items():
+                if not isinstance(value, (float, list)):
+                    raise plugin.error(f"{name} of a checkerboard must be a colour, not a texture")
+            record = description.Checkerboard(**colours, uv_transform=_uv_transform(plugin))
+            plugin.finish()
+            return record
+        raise plugin.error(f"{plugin.label()} is not supported; supported: bitmap, checkerboard, uniform")
+
+    def _bitmap(self, plugin, scalar):
+        element = plugin.get("filename")
+        if element is None:
+            raise plugin.error(f"{plugin.label()} needs a filename")
+        file = self.document.find(plugin.string("filename", ""), element)
+        raw = plugin.boolean("raw")
+        plugin.ignore("format", "accel", "cache", "max_anisotropy")
+        gamma = plugin.number("gamma", -1.0)
+        if gamma not in (-1.0, 1.0):
+            raise plugin.get("gamma").error(f"gamma {gamma:g} is not supported; allowed: 1 (linear), -1 (automatic)")
+        if raw or gamma == 1.0:
+            space = "linear"
+        else:
+            # Mitsuba linearises 8-bit images even where they stand for a number
+            space = "srgb" if scalar and file.suffix.lower() in _LDR_SUFFIXES else "auto"
+        kinds = ("bilinear", "nearest", "trilinear", "ewa")
+        kind = plugin.string("filter_type", "bilinear", kinds)
+        if kind in kinds[2:]:
+            self.warn(f"{plugin.where()}: texture filter {kind!r} is taken as 'bilinear'")
+        record = description.Bitmap(
+            file=str(file),
+            color_space=space,
+            filter="nearest" if kind == "nearest" else "bilinear",
+            wrap=self._wrap(plugin),
+            uv_transform=_uv_transform(plugin),
+        )
+        plugin.finish()
+        return record
+
+    def _wrap(self, plugin):
+        modes = ("repeat", "mirror", "clamp")
+        found = {plugin.string(name, "repeat", modes) for name in _WRAPS if plugin.has(name)}
+        if len(found) > 1:
+            raise plugin.error("different wrap modes for u and v are not supported")
+        return found.pop() if found else "repeat"
+
+
+_WRAPS = ("wrap_mode", "wrap_mode_u", "wrap_mode_v")
+
+
+def colour_value(element: Element, limit: float | None = None, emitted: bool = False) -> float | list[float]:
+    """A float, or a list of three, from <float>, <integer>, <rgb>, <srgb> or a constant <spectrum>, linear Rec. 709.
+
+    Raises:
+        SceneError: With file and line: another element, negative or above `limit`, a sampled spectrum.
+    """
+    tag = element.tag
+    if tag not in ("float", "integer", "rgb", "srgb", "spectrum"):
+        raise element.error(f"{element.attributes.get('name')!r} must be a colour, not <{tag}>")
+    if tag == "spectrum" and "filename" in element.attributes:
+        raise element.error("spectra from files are not supported; use <rgb>")
+    element.check_attributes("name", "value", *(["intent"] if tag == "spectrum" else []))
+    text = element.attribute("value")
+    if tag in ("float", "integer"):
+        value = to_number(element, text)
+    elif tag == "spectrum":
+        if ":" in text:
+            raise element.error("sampled spectra are not supported; use <rgb>, or a <spectrum> with one number")
+        value = to_number(element, text)
+        if emitted:
+            value = [channel * value for channel in EQUAL_ENERGY]
+    else:
+        value = _three(element, text)
+        if tag == "srgb":
+            value = [_decode(channel) for channel in value]
+    values = value if isinstance(value, list) else [value]
+    if min(values) < 0.0 or (limit is not None and max(values) > limit):
+        allowed = "at least 0" if limit is None else f"from 0 to {limit:g}"
+        raise element.error(f"{element.attributes.get('name')!r} must be {allowed}; found {text!r}")
+    return value
+
+
+def _three(element, text):
+    text = text.strip()
+    if element.tag == "srgb" and text.startswith("#"):
+        try:
+            if len(text) != 7:
+                raise ValueError
+            return [int(text[i : i + 2], 16) / 255.0 for i in (1, 3, 5)]
+        except ValueError:
+            raise element.error(f"{text!r} is not a colour such as #a0b0c0") from None
+    numbers = to_numbers(element, text)
+    if len(numbers) not in (1, 3):
+        raise element.error(f"<{element.tag}> needs one or three numbers; found {len(numbers)}")
+    return numbers * (3 // len(numbers))
+
+
+def _decode(value):
+    """sRGB to linear (IEC 61966-2-1)."""
+    return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4
+
+
+def _is_smooth(alpha):
+    return isinstance(alpha, float) and alpha < SMOOTHEST
+
+
+def _scaled(plugin, value, scale):
+    if scale == 1.0:
+        return value
+    if isinstance(value, float):
+        return value * scale
+    if isinstance(value, list):
+        return [channel * scale for channel in value]
+    raise plugin.error("ext_eta beside a textured eta or k is not supported")
+
+
+def _uv_transform(plugin):
+    """Rows of the 2x3 matrix in a to_uv, of which Mitsuba leaves out what belongs to z."""
+    matrix = plugin.transform("to_uv")
+    if matrix is None:
+        return description.IDENTITY_UV
+    return tuple((float(row[0]), float(row[1]), float(row[3])) for row in matrix[:2])
