@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import warp as _wp
 
-_wp.config.quiet = True  # the command has its own line for compilation
+if _wp.config.log_level == _wp.LOG_INFO:  # one line per kernel is for those who ask for it
+    _wp.config.log_level = _wp.LOG_WARNING
 
 from wavefront.errors import SceneError, WavefrontError  # noqa: E402
 from wavefront.renderer import Renderer  # noqa: E402

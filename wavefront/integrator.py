@@ -12,7 +12,6 @@ import dataclasses
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
 
 import numpy as np
 import warp as wp
@@ -278,7 +277,7 @@ class Worker:
 
 
 def plan_tiles(width: int, height: int, capacity: int, first_sample: int, sample_count: int) -> list[Tile]:
-    """Tiles of at most `capacity` paths that cover the film once, in Morton-free scanline order.
+    """Tiles of at most `capacity` paths that cover the film once, tile rows from the top.
 
     Samples of one pixel share a tile as long as a tile keeps some hundred pixels, because their camera rays are alike.
     """
@@ -332,6 +331,3 @@ def run_tiles(workers: list[Worker], tiles: list[Tile]) -> None:
             thread.join()
         if errors:
             raise errors[0]
-
-
-PassCallback = Callable[["object"], None]

@@ -9,7 +9,6 @@ import sys
 import time
 from pathlib import Path
 
-import warp as wp
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
@@ -260,5 +259,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    wp.config.quiet = True
     sys.exit(main())

@@ -166,6 +166,15 @@ def test_a_type_that_stands_alone_can_be_left_out(write):
     assert scene.emitters == [d.Constant(radiance=2.0)]
 
 
+@pytest.mark.parametrize("depth", [2, 200, 900, 5000, 100_000])
+def test_deep_nesting_is_an_error_whatever_the_depth(error, depth):
+    text = '{"bsdfs": [' + '{"type": "mask", "bsdf": ' * depth + '{"type": "diffuse"}' + "}" * depth + "]}"
+    illegal = "bsdfs[0].bsdf: a mask cannot hold another mask; multiply their opacities"
+    assert error(text) in (f"s.json: {illegal}", "s.json: nested too deeply")
+    text = text.replace('"diffuse"', '"difuse"')
+    assert error(text).startswith("s.json: bsdfs[0].bsdf.bsdf" if depth < 200 else "s.json: ")
+
+
 # --- overrides -------------------------------------------------------------------------------------------------
 
 

@@ -13,7 +13,7 @@ MIRROR = [TransformStep(scale=(-1.0, 2.0, 1.0)), TransformStep(translate=(1.0, 2
 SHEAR = [(1.0, 0.5, 0.0, 1.0), (0.0, 2.0, 0.3, 0.0), (0.2, 0.0, 1.0, 4.0), (0.0, 0.0, 0.0, 1.0)]
 
 # A quad and a triangle, two groups, with seams in UVs and normals, polygons of mixed size.
-OBJ = """# comment
+OBJ = """# usemtl comment
 o first
 v 0 0 0
 v 1 0 0
@@ -30,6 +30,7 @@ g one
 usemtl red
 f 1/1/1 2/2/2 3/3/3 4/4/1
 g two
+# usemtl green
 usemtl blue
 v 2 0 0
 f 2/4/1 5/2/3 3/1/2
@@ -151,6 +152,29 @@ def test_obj_against_mitsuba(mi, tmp_path):
         mesh = meshes.tessellate(d.Mesh(file=str(path), **ours))
         assert len(mesh.faces) == 4
         assert_same_corners(corners(mesh), mitsuba_corners(mi, shape))
+
+
+def test_obj_with_windows_line_ends_and_tabs(tmp_path):
+    found = []
+    for name, text in (("a.obj", OBJ), ("b.obj", OBJ.replace("\n", "\r\n")), ("c.obj", OBJ.replace(" ", "\t"))):
+        (tmp_path / name).write_bytes(text.encode())
+        found.append(meshes.tessellate(d.Mesh(file=str(tmp_path / name))))
+    for other in found[1:]:
+        for name in ("vertices", "faces", "normals", "uvs"):
+            np.testing.assert_array_equal(getattr(other, name), getattr(found[0], name))
+
+
+def test_ply_polygons_of_mixed_size_become_fans(tmp_path):
+    path = tmp_path / "a.ply"
+    points = [(np.cos(t), np.sin(t), 0.0) for t in 2 * np.pi * np.arange(5) / 5]
+    lines = ["ply", "format ascii 1.0", "element vertex 5", *(f"property float {name}" for name in "xyz")]
+    lines += ["element face 2", "property list uchar int vertex_indices", "end_header"]
+    lines += [f"{x} {y} {z}" for x, y, z in points] + ["5 0 1 2 3 4", "3 0 2 1", ""]
+    path.write_text("\n".join(lines))
+    mesh = meshes.tessellate(d.Mesh(file=str(path)))
+    assert len(mesh.faces) == 4
+    pentagon, ear = 2.5 * np.sin(2 * np.pi / 5), np.sin(2 * np.pi / 5) - 0.5 * np.sin(4 * np.pi / 5)
+    assert area(mesh) == pytest.approx(pentagon + ear, rel=1e-6)
 
 
 @pytest.mark.parametrize("header", ["s t", "u v"])

@@ -78,7 +78,6 @@ def _load_pillow(path, where):
             grey = image.mode in ("1", "L", "LA", "La")
             if image.mode == "P" and image.palette is not None and image.palette.mode in ("L", "LA"):
                 grey = True
-            # through RGBA, so that a transparent palette entry keeps its colour
             pixels = np.asarray(image.convert("L" if grey else "RGB"), np.uint8)
     except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
         text = "not an image" if "cannot identify" in str(error) else " ".join(str(error).split())

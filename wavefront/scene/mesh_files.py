@@ -140,6 +140,8 @@ def _read_obj(path):
     data = Path(path).read_bytes()
     if b"\t" in data or b"\n " in data:
         data = re.sub(rb"(?m)^ +", b"", data.replace(b"\t", b" "))
+    if b"#" in data:
+        data = re.sub(rb"#[^\n]*", b"", data)
     # without these lines trimesh makes one mesh of all groups, in file order
     data = re.sub(rb"(?m)^(?:usemtl|mtllib|[ogs])(?: .*)?$", b"", data) if _has_groups(data) else data
     if not re.search(rb"(?m)^f ", data):

@@ -70,7 +70,7 @@ def tessellate(shape: description.AnyShape, where: str = "") -> TriangleMesh:
     if not np.isfinite(vertices).all():
         raise SceneError(f"{prefix}a vertex leaves the range of 32-bit floats after to_world", path=where)
     if normals is not None:
-        normals = normals @ np.linalg.inv(matrix[:3, :3])
+        normals = _scaled(_scaled(normals, axis=1) @ _scaled(np.linalg.inv(matrix[:3, :3])), axis=1)
     if is_mirror(matrix):
         faces = faces[:, ::-1]
     kept = _has_area(vertices, faces)
@@ -171,6 +171,12 @@ def _unit_normals(normals, vertices, faces):
         normals = np.where(length > 0.0, normals, (0.0, 0.0, 1.0))
         length = np.where(length > 0.0, length, 1.0)
     return normals / length
+
+
+def _scaled(vectors, axis=None):
+    """The array, or each row for axis 1, scaled so that its largest number is 1: lengths must not overflow."""
+    largest = np.abs(vectors).max(axis=axis, keepdims=True)
+    return vectors / np.where(largest > 0.0, largest, 1.0)
 
 
 def _angle_weighted(vertices, faces):

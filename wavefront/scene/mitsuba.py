@@ -52,8 +52,10 @@ def load(
     """
     if warn is None:
         warn = _default_warn
-    document = read(Path(path), parameters or {})
-    return _Importer(document, warn).scene()
+    try:
+        return _Importer(read(Path(path), parameters or {}), warn).scene()
+    except RecursionError:
+        raise SceneError("references are nested too deeply", path) from None
 
 
 def _default_warn(message):

@@ -26,6 +26,7 @@ class Element:
 
     def error(self, message: str) -> SceneError:
         """An error at this element's line."""
+        message = message if len(message) <= 400 else message[:400] + "..."
         return SceneError(message, self.file, f"line {self.line}")
 
     def where(self) -> str:
@@ -113,6 +114,7 @@ def _step_matrix(step):
     if tag == "rotate":
         angle = to_number(step, step.attribute("angle"))
         try:
+            # an axis of any length is a direction, as in Mitsuba 0.6; Mitsuba 3.9 would also scale by it
             return transforms.rotate(to_xyz(step, 0.0), angle)
         except SceneError as error:
             raise step.error(error.message) from None

@@ -24,17 +24,11 @@ def to_matrix(transform: Transform, where: str = "") -> np.ndarray:
         SceneError: Rows and steps mixed, a step without exactly one key, a zero rotation axis, a degenerate look-at,
             a number that is not finite, a projective or a singular matrix.
     """
-    matrix = np.eye(4)
-    if transform and not any(isinstance(item, TransformStep) for item in transform):
-        matrix = _rows(transform, where)
-    else:
-        for i, step in enumerate(transform):
-            if not isinstance(step, TransformStep):
-                raise SceneError("matrix rows and steps cannot be mixed in one transform", path=where)
-            factor = _step(step, f"{where}[{i}]")
-            check_affine(factor, f"{where}[{i}]")
-            with np.errstate(over="ignore", invalid="ignore"):  # reported below
-                matrix = factor @ matrix
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is reported by the checks
+        if transform and not any(isinstance(item, TransformStep) for item in transform):
+            matrix = _rows(transform, where)
+        else:
+            matrix = _product(transform, where)
     check_affine(matrix, where)
     check_invertible(matrix, where)
     return matrix
@@ -57,7 +51,7 @@ def check_invertible(matrix: np.ndarray, where: str = "") -> None:
 
 def is_mirror(matrix: np.ndarray) -> bool:
     """Whether the (4, 4) matrix turns a right-handed frame into a left-handed one."""
-    return bool(np.linalg.det(matrix[:3, :3]) < 0.0)
+    return bool(np.linalg.slogdet(matrix[:3, :3])[0] < 0.0)
 
 
 def look_at(origin, target, up, where: str = "") -> np.ndarray:
@@ -90,6 +84,17 @@ def rotate(axis, angle: float, where: str = "") -> np.ndarray:
     theta = np.radians(angle)
     matrix = np.eye(4)
     matrix[:3, :3] += np.sin(theta) * cross + (1.0 - np.cos(theta)) * (cross @ cross)
+    return matrix
+
+
+def _product(steps, where):
+    matrix = np.eye(4)
+    for i, step in enumerate(steps):
+        if not isinstance(step, TransformStep):
+            raise SceneError("matrix rows and steps cannot be mixed in one transform", path=where)
+        factor = _step(step, f"{where}[{i}]")
+        check_affine(factor, f"{where}[{i}]")
+        matrix = factor @ matrix
     return matrix
 
 
