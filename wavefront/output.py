@@ -71,9 +71,11 @@ def scene_hash(scene: description.Scene) -> str:
         file = getattr(record, "file", None)
         if file and file not in files:
             with open(file, "rb") as stream:
-                files[file] = hashlib.file_digest(stream, "sha256").hexdigest() if hasattr(
-                    hashlib, "file_digest"
-                ) else hashlib.sha256(stream.read()).hexdigest()
+                files[file] = (
+                    hashlib.file_digest(stream, "sha256").hexdigest()
+                    if hasattr(hashlib, "file_digest")
+                    else hashlib.sha256(stream.read()).hexdigest()
+                )
 
     def replace(value):
         if isinstance(value, dict):

@@ -197,6 +197,7 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
     Raises:
         WavefrontError: With the one line that the user needs.
     """
+
     def warn(message: str) -> None:
         console.print(f"warning: {message}", markup=False, highlight=False, soft_wrap=True)
 

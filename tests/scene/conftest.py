@@ -26,6 +26,7 @@ def xml_folder(tmp_path):
         "property float u\nproperty float v\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
         "0 0 0 .1 .2\n1 0 0 .9 .2\n1 1 0 .9 .8\n3 0 1 2\n"
     )
+    (tmp_path / "bent.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0.5\nv 0 1 2\nv -1 0 1\nf 1 2 3\nf 1 3 4\nf 1 4 5\n")
     pixels = np.random.default_rng(4).integers(0, 256, (4, 8, 3), np.uint8)
     Image.fromarray(pixels).save(tmp_path / "colours.png")
     return tmp_path

@@ -181,14 +181,14 @@ def test_ply_polygons_of_mixed_size_become_fans(tmp_path):
 def test_ply_against_mitsuba(mi, tmp_path, header):
     path = tmp_path / "a.ply"
     names = ["x", "y", "z", "nx", "ny", "nz", *header.split()]
-    rows = np.random.default_rng(5).uniform(-1.0, 1.0, (4, 8)).astype(np.float32)
-    lines = ["ply", "format ascii 1.0", "element vertex 4", *(f"property float {name}" for name in names)]
+    rows = np.random.default_rng(5).uniform(-1.0, 1.0, (5, 8)).astype(np.float32)
+    lines = ["ply", "format ascii 1.0", "element vertex 5", *(f"property float {name}" for name in names)]
     lines += ["element face 2", "property list uchar int vertex_indices", "end_header"]
-    lines += [" ".join(map(repr, map(float, row))) for row in rows] + ["3 0 1 2", "3 3 2 1", ""]
+    lines += [" ".join(map(repr, map(float, row))) for row in rows] + ["3 4 1 2", "3 3 2 1", ""]
     path.write_text("\n".join(lines))
     mesh = meshes.tessellate(d.Mesh(file=str(path)))
-    np.testing.assert_array_equal(mesh.vertices, rows[:, :3])
-    np.testing.assert_array_equal(mesh.uvs, rows[:, 6:])
+    np.testing.assert_array_equal(mesh.vertices, rows[:, :3])  # the one that no face uses, too
+    np.testing.assert_array_equal(mesh.uvs[1:], rows[1:, 6:])
     shape = mi.load_dict({"type": "ply", "filename": str(path)})
     assert_same_corners(corners(mesh), mitsuba_corners(mi, shape))
     flipped = meshes.tessellate(d.Mesh(file=str(path), flip_v=True))

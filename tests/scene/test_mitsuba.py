@@ -138,6 +138,23 @@ def test_shading_side_and_texture_are_those_of_mitsuba(mi, load_xml, xml_folder,
         np.testing.assert_allclose(found, linear, atol=2e-3)  # Mitsuba stores half precision
 
 
+@pytest.mark.parametrize("flat", [False, True])
+@pytest.mark.parametrize("place", PLACES)
+def test_computed_normals_are_those_of_mitsuba(mi, load_xml, xml_folder, place, flat):
+    flag = f'<boolean name="face_normals" value="{str(flat).lower()}"/>'
+    body = '<shape type="obj"><string name="filename" value="bent.obj"/>' + flag + PLACES[place] + "</shape>"
+    mesh = meshes.tessellate(load_xml(body).shapes[0])
+    scene = mi.load_file(str(xml_folder / "scene.xml"))
+    weights = np.array((0.2, 0.3, 0.5))
+    for face in mesh.faces:
+        corners = mesh.vertices[face].astype(np.float64)
+        front = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+        front /= np.linalg.norm(front)
+        normal = front if flat else weights @ mesh.normals[face]
+        hit = scene.ray_intersect(mi.Ray3f(weights @ corners + 0.01 * front, -front))
+        np.testing.assert_allclose(np.array(hit.sh_frame.n), normal / np.linalg.norm(normal), atol=1e-5)
+
+
 def test_spheres(mi, load_xml, xml_folder):
     body = '<shape type="sphere"><point name="center" x="1" y="2" z="3"/><float name="radius" value="0.5"/>{}</shape>'
     for place in ("", '<transform name="to_world"><scale value="2"/><translate x="1"/></transform>',

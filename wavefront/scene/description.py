@@ -58,7 +58,9 @@ class TransformStep(Record):
 # Four rows of four numbers (column vectors), or steps of which the first is applied first.
 Transform = Annotated[
     list[TransformStep | Vec4],
-    Meta(description="Four rows of a 4x4 matrix that acts on column vectors, or a list of steps; the first step is applied first."),
+    Meta(
+        description="Four rows of a 4x4 matrix that acts on column vectors, or a list of steps; the first step is applied first."
+    ),
 ]
 
 # --- textures --------------------------------------------------------------------------------------------------
@@ -77,7 +79,9 @@ class Bitmap(Record, tag_field="type", tag="bitmap"):
     name: str = ""
     color_space: Annotated[
         Literal["auto", "srgb", "linear"],
-        Meta(description="How values are encoded; auto: 8-bit colours are sRGB, OpenEXR and scalar parameters are linear."),
+        Meta(
+            description="How values are encoded; auto: 8-bit colours are sRGB, OpenEXR and scalar parameters are linear."
+        ),
     ] = "auto"
     filter: Literal["bilinear", "nearest"] = "bilinear"
     wrap: Literal["repeat", "mirror", "clamp"] = "repeat"
@@ -143,7 +147,9 @@ class Dielectric(Record, tag_field="type", tag="dielectric"):
     """Smooth boundary between two dielectrics; the normal points to the exterior."""
 
     name: str = ""
-    int_ior: Annotated[IOR, Meta(description="Interior index of refraction, or a name such as water, bk7, diamond.")] = 1.5046
+    int_ior: Annotated[
+        IOR, Meta(description="Interior index of refraction, or a name such as water, bk7, diamond.")
+    ] = 1.5046
     ext_ior: Annotated[IOR, Meta(description="Exterior index of refraction, or a name.")] = 1.000277
     specular_reflectance: Reflectance = 1.0
     specular_transmittance: Reflectance = 1.0
@@ -153,7 +159,9 @@ class RoughDielectric(Record, tag_field="type", tag="rough_dielectric"):
     """Boundary between two dielectrics with a microfacet surface, isotropic."""
 
     name: str = ""
-    int_ior: Annotated[IOR, Meta(description="Interior index of refraction, or a name such as water, bk7, diamond.")] = 1.5046
+    int_ior: Annotated[
+        IOR, Meta(description="Interior index of refraction, or a name such as water, bk7, diamond.")
+    ] = 1.5046
     ext_ior: Annotated[IOR, Meta(description="Exterior index of refraction, or a name.")] = 1.000277
     specular_reflectance: Reflectance = 1.0
     specular_transmittance: Reflectance = 1.0
@@ -213,13 +221,18 @@ class Shape(Record):
 class Mesh(Shape, tag_field="type", tag="mesh"):
     """Triangles from a PLY, OBJ or glTF file, or inline. UVs and normals are per vertex."""
 
-    file: Annotated[str | None, Meta(description="PLY, OBJ, glTF or GLB, relative to the scene file; excludes vertices and faces.")] = None
+    file: Annotated[
+        str | None, Meta(description="PLY, OBJ, glTF or GLB, relative to the scene file; excludes vertices and faces.")
+    ] = None
     vertices: list[Vec3] | None = None
     faces: list[tuple[int, int, int]] | None = None
     normals: list[Vec3] | None = None
     uvs: list[Vec2] | None = None
     face_normals: Annotated[bool, Meta(description="Ignore vertex normals: shade every triangle flat.")] = False
-    smooth_normals: Annotated[bool, Meta(description="Compute vertex normals where there are none: means of the face normals weighted by angle.")] = False
+    smooth_normals: Annotated[
+        bool,
+        Meta(description="Compute vertex normals where there are none: means of the face normals weighted by angle."),
+    ] = False
     flip_v: Annotated[bool | None, Meta(description="Turn v into 1 - v; default: for OBJ files only.")] = None
 
 
@@ -277,16 +290,33 @@ class Film(Record):
     width: Annotated[int, Meta(ge=1, le=65536)] = 512
     height: Annotated[int, Meta(ge=1, le=65536)] = 512
     filter: Filter = msgspec.field(default_factory=BoxFilter)
-    aovs: Annotated[list[Aov], Meta(description="Extra channels: first-hit albedo, shading normal, depth; variance of the mean luminance.")] = []
-    precision: Annotated[Literal["float", "half"], Meta(description="Of the EXR file; half overflows at 65504.")] = "float"
+    aovs: Annotated[
+        list[Aov],
+        Meta(description="Extra channels: first-hit albedo, shading normal, depth; variance of the mean luminance."),
+    ] = []
+    precision: Annotated[Literal["float", "half"], Meta(description="Of the EXR file; half overflows at 65504.")] = (
+        "float"
+    )
 
 
 class PathIntegrator(Record, tag_field="type", tag="path"):
     """Unidirectional path tracing with multiple importance sampling."""
 
-    max_depth: Annotated[int, Meta(ge=1, le=1_000_000, description="Longest path in segments: 1 is emission seen directly, 2 adds direct light.")] = 16
-    rr_depth: Annotated[Annotated[int, Meta(ge=1)] | None, Meta(description="Depth from which Russian roulette may end a path; null: never.")] = 5
-    nee: Annotated[bool, Meta(description="Next-event estimation; false: emitters are found by BSDF sampling only.")] = True
+    max_depth: Annotated[
+        int,
+        Meta(
+            ge=1,
+            le=1_000_000,
+            description="Longest path in segments: 1 is emission seen directly, 2 adds direct light.",
+        ),
+    ] = 16
+    rr_depth: Annotated[
+        Annotated[int, Meta(ge=1)] | None,
+        Meta(description="Depth from which Russian roulette may end a path; null: never."),
+    ] = 5
+    nee: Annotated[
+        bool, Meta(description="Next-event estimation; false: emitters are found by BSDF sampling only.")
+    ] = True
     spp: Annotated[int, Meta(ge=1, le=2**31 - 1, description="Samples per pixel.")] = 64
 
 
@@ -299,6 +329,10 @@ class Scene(Record):
     integrator: PathIntegrator = msgspec.field(default_factory=PathIntegrator)
     textures: Annotated[list[Texture], Meta(description="Named textures.")] = []
     bsdfs: Annotated[list[Bsdf], Meta(description="Named BSDFs.")] = []
-    emitters: Annotated[list[Emitter], Meta(description="Emitters that are not shapes; at most one constant environment.")] = []
-    include: Annotated[list[str], Meta(description="Scene files whose textures, bsdfs, emitters and shapes are added to this one.")] = []
+    emitters: Annotated[
+        list[Emitter], Meta(description="Emitters that are not shapes; at most one constant environment.")
+    ] = []
+    include: Annotated[
+        list[str], Meta(description="Scene files whose textures, bsdfs, emitters and shapes are added to this one.")
+    ] = []
     description: Annotated[str, Meta(description="What the scene is for.")] = ""

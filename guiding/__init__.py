@@ -1,0 +1,1 @@
+"""Path guiding methods. They see the renderer through `wavefront.guide` only."""

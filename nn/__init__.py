@@ -1,0 +1,1 @@
+"""Encodings, fused networks, losses and optimisers. Knows nothing of rendering."""
