@@ -18,7 +18,7 @@ import wavefront
 from wavefront.errors import WavefrontError
 from wavefront.renderer import Renderer, peak_memory_bytes
 from wavefront.scene import description
-from wavefront.scene.images import replacing, write_exr, write_png
+from wavefront.scene.images import HalfOverflowError, replacing, write_exr, write_png
 from wavefront.scene.lookup import walk
 
 
@@ -142,11 +142,19 @@ def write_outputs(exr: Path, renderer: Renderer, exposure: float, account: dict)
     """Writes the three files, each under a temporary name first.
 
     Raises:
-        WavefrontError: A file cannot be written, or a value overflows half precision.
+        WavefrontError: A file cannot be written; or a value overflows half precision, in which case the image is
+            there in 32-bit floats all the same.
     """
     exr, png, account_path = output_paths(exr)
     channels = renderer.film.channels()
-    write_exr(exr, channels, half=renderer.scene.film.precision == "half")
+    overflow = None
+    try:
+        write_exr(exr, channels, half=renderer.scene.film.precision == "half")
+    except HalfOverflowError as error:
+        overflow = error
+        write_exr(exr, channels)
     write_png(png, tone_map(renderer.film.image(), exposure))
     with replacing(account_path) as temporary:
         temporary.write_text(json.dumps(account, indent=2) + "\n", encoding="utf-8")
+    if overflow is not None:
+        raise WavefrontError(f"{overflow}; nothing is lost: it was written as 32-bit floats")

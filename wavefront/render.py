@@ -159,7 +159,9 @@ def run_with_progress(renderer: Renderer, console: Console, spp: int | None, sec
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    with Interrupt(console) as interrupt, Progress(*columns, console=console, transient=False) as progress:
+    film, workers = renderer.scene.film, f" with {renderer.threads} threads" if renderer.device == "cpu" else ""
+    with Interrupt(console) as interrupt, Progress(*columns, console=console) as progress:
+        console.print(f"rendering {film.width}x{film.height} on {renderer.device}{workers}", highlight=False)
         task = progress.add_task("", total=seconds or spp, spp="0 spp", rate="")
 
         def update(r: Renderer) -> bool:

@@ -133,6 +133,9 @@ class Renderer:
         self.statistics.compile_seconds = time.perf_counter() - start
 
     def _plan_capacity(self, memory: int, pixels: int) -> int:
+        """Paths in flight per worker, from the memory budget."""
+        if pixels > 2**31 - 1:
+            raise WavefrontError(f"a film of {pixels} pixels; allowed: up to 2^31 - 1")
         left = memory - pixels * self.bytes_per_pixel
         capacity = min(
             CPU_CAPACITY if self.device == "cpu" else CUDA_CAPACITY, left // (self.bytes_per_path * self.threads)

@@ -154,10 +154,15 @@ def test_obj_against_mitsuba(mi, tmp_path):
         assert_same_corners(corners(mesh), mitsuba_corners(mi, shape))
 
 
-def test_obj_with_windows_line_ends_and_tabs(tmp_path):
+def test_obj_with_windows_line_ends_tabs_and_umlauts(tmp_path):
     found = []
-    for name, text in (("a.obj", OBJ), ("b.obj", OBJ.replace("\n", "\r\n")), ("c.obj", OBJ.replace(" ", "\t"))):
-        (tmp_path / name).write_bytes(text.encode())
+    for name, text in {
+        "a.obj": OBJ,
+        "b.obj": OBJ.replace("\n", "\r\n"),
+        "c.obj": OBJ.replace(" ", "\t"),
+        "d.obj": OBJ.replace("red", "ÄÖÜ"),
+    }.items():
+        (tmp_path / name).write_bytes(text.encode("latin-1"))
         found.append(meshes.tessellate(d.Mesh(file=str(tmp_path / name))))
     for other in found[1:]:
         for name in ("vertices", "faces", "normals", "uvs"):
@@ -363,6 +368,7 @@ PLY_FACE = "element face 1\nproperty list uchar int vertex_indices\nend_header\n
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\n", "relative (negative) indices"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n", "vertices[2] is not finite"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 x 0\nf 1 2 3\n", "not a readable OBJ file"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0\nf 1/1 2/1 3/1\n", "uvs do not have 2 numbers each"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "all of its triangles have zero area"),
         ("a.ply", "not a ply", "not a readable PLY file"),
         ("a.ply", PLY_HEAD + "end_header\n0 0 0\n1 0 0\n0 1 0\n", "empty mesh"),

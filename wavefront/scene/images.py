@@ -17,6 +17,10 @@ from wavefront.errors import SceneError, WavefrontError
 HALF_MAX = 65504.0
 
 
+class HalfOverflowError(WavefrontError):
+    """A value does not fit 16-bit floats."""
+
+
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike) -> Iterator[Path]:
     """Gives a temporary path beside `path` to write to, which then replaces it; after an error nothing is left.
@@ -114,8 +118,8 @@ def write_exr(path: str | os.PathLike, channels: dict[str, np.ndarray], half: bo
         half: 16-bit floats; else 32-bit.
 
     Raises:
-        WavefrontError: No channels or of different shapes, a finite value beyond 65504 in half precision, or a file
-            that cannot be written.
+        HalfOverflowError: A finite value beyond 65504 in half precision.
+        WavefrontError: No channels or of different shapes, or a file that cannot be written.
     """
     shapes = {np.shape(pixels) for pixels in channels.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 2 or 0 in next(iter(shapes)):
@@ -126,9 +130,8 @@ def write_exr(path: str | os.PathLike, channels: dict[str, np.ndarray], half: bo
         if half:
             finite = np.abs(pixels[np.isfinite(pixels)])
             if finite.size and finite.max() > HALF_MAX:
-                raise WavefrontError(
-                    f"{path}: channel {name} has {finite.max():.6g}, but half precision ends at 65504; "
-                    "write 32-bit floats instead"
+                raise HalfOverflowError(
+                    f"{path}: channel {name} has {finite.max():.6g}, but half precision ends at 65504"
                 )
             pixels = pixels.astype(np.float16)
         data[name] = pixels

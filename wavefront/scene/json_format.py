@@ -211,6 +211,10 @@ def _apply_override(raw, override, path):
         elif not isinstance(holder, dict):
             raise SceneError(f"{place} has no keys; found {found(holder)} (set by {shown(override)})", path)
         if i == len(steps) - 1:
+            if step == "type" and holder.get("type") != value:  # another type starts from its own defaults
+                kept = holder.get("name")
+                holder.clear()
+                holder.update({} if kept is None else {"name": kept})
             holder[step] = value
             break
         default = default.get(step, {}) if isinstance(default, dict) and isinstance(step, str) else {}

@@ -91,8 +91,11 @@ def _read(path, suffix, _mtime, _size):
         raise _Unreadable(f"not a readable {suffix[1:].upper()} file ({text[:120]})") from None
     if not len(mesh.faces):
         raise _Unreadable("empty mesh: it has no triangles")
-    for array in (mesh.vertices, mesh.faces, mesh.normals, mesh.uvs):
+    for name, width in (("vertices", 3), ("faces", 3), ("normals", 3), ("uvs", 2)):
+        array = getattr(mesh, name)
         if array is not None:
+            if array.ndim != 2 or array.shape[1] != width:
+                raise _Unreadable(f"its {name} do not have {width} numbers each")
             array.flags.writeable = False
     return mesh
 
@@ -137,7 +140,10 @@ def _corner_uvs(face_data, polygons):
 
 
 def _read_obj(path):
-    data = Path(path).read_bytes()
+    data = Path(path).read_bytes().removeprefix(b"\xef\xbb\xbf")
+    if not data.isascii():
+        # only names and comments have other letters; trimesh would need another library to tell their encoding
+        data = data.decode("latin-1").encode("ascii", "replace")
     if b"\t" in data or b"\n " in data:
         data = re.sub(rb"(?m)^ +", b"", data.replace(b"\t", b" "))
     if b"#" in data:

@@ -1,0 +1,1 @@
+"""Other renderers, as peers to compare images and speed with."""

@@ -1,0 +1,172 @@
+"""Our scene records as a dictionary for `mitsuba.load_dict`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from wavefront.errors import WavefrontError
+from wavefront.scene import description
+from wavefront.scene.lookup import resolve_bsdf, resolve_texture
+from wavefront.scene.meshes import tessellate, write_ply
+from wavefront.scene.transforms import is_mirror, to_matrix
+
+# Mitsuba's camera looks along +Z with +X to the left; ours along -Z with +X to the right.
+CAMERA_FRAME = np.diag([-1.0, 1.0, -1.0, 1.0])
+NEVER = 1 << 30  # Russian roulette that never comes
+
+
+def from_records(scene: description.Scene, folder: str | Path) -> dict:
+    """The scene as Mitsuba's dictionary, in the current variant of Mitsuba.
+
+    `integrator.nee` is left out: Mitsuba's `path` always samples lights, which changes the noise but not the mean.
+
+    Args:
+        scene: Valid records (see `wavefront.scene.validate`); file paths absolute.
+        folder: Where meshes are written as PLY. They must exist until the dictionary is loaded.
+
+    Raises:
+        WavefrontError: The records say what Mitsuba cannot.
+    """
+    return _Writer(scene, Path(folder)).scene_dict()
+
+
+class _Writer:
+    def __init__(self, scene: description.Scene, folder: Path):
+        import mitsuba
+
+        self.mi, self.scene, self.folder = mitsuba, scene, folder
+
+    def scene_dict(self):
+        integrator = self.scene.integrator
+        result = {
+            "type": "scene",
+            "integrator": {
+                "type": "path",
+                "max_depth": integrator.max_depth,
+                "rr_depth": NEVER if integrator.rr_depth is None else integrator.rr_depth,
+            },
+            "sensor": self._camera(),
+        }
+        for i, emitter in enumerate(self.scene.emitters):
+            result[f"emitter_{i}"] = {"type": "constant", "radiance": _colour(emitter.radiance)}
+        for i, shape in enumerate(self.scene.shapes):
+            result[f"shape_{i}"] = self._shape(i, shape)
+        return result
+
+    def _camera(self):
+        camera, film = self.scene.camera, self.scene.film
+        kind = type(film.filter).__struct_config__.tag
+        rfilter = {"type": kind}
+        rfilter |= {name: getattr(film.filter, name) for name in film.filter.__struct_fields__}
+        return {
+            "type": "perspective",
+            "fov": camera.fov,
+            "fov_axis": camera.fov_axis,
+            "near_clip": 1e-3,  # ours clips nothing
+            "far_clip": 1e5,
+            "to_world": self._transform(to_matrix(camera.to_world, "camera.to_world") @ CAMERA_FRAME),
+            "film": {
+                "type": "hdrfilm",
+                "width": film.width,
+                "height": film.height,
+                "pixel_format": "rgb",
+                "component_format": "float32",
+                "rfilter": rfilter,
+            },
+            "sampler": {"type": "independent", "sample_count": integrator_spp(self.scene)},
+        }
+
+    def _transform(self, matrix):
+        return self.mi.ScalarTransform4f(np.asarray(matrix, np.float64).tolist())
+
+    # --- shapes --------------------------------------------------------------------------------------------------
+
+    def _shape(self, index, shape):
+        where = f"shapes[{index}]"
+        result = {"bsdf": self._bsdf(shape.bsdf)}
+        if shape.emitter is not None:
+            result["emitter"] = {"type": "area", "radiance": self._parameter(shape.emitter.radiance)}
+        if isinstance(shape, description.Mesh):
+            # The triangles that we read ourselves: reading files is compared through Mitsuba's XML.
+            mesh = tessellate(shape, where)
+            file = self.folder / f"shape_{index}.ply"
+            write_ply(file, mesh)
+            return result | {"type": "ply", "filename": str(file), "face_normals": mesh.normals is None}
+        matrix = to_matrix(shape.to_world, f"{where}.to_world")
+        flip = shape.flip_normals
+        if isinstance(shape, description.Sphere):
+            result |= {"type": "sphere", "center": list(shape.center), "radius": shape.radius}
+            flip ^= is_mirror(matrix)  # Mitsuba turns a mirrored sphere inside out
+        else:
+            result["type"] = type(shape).__struct_config__.tag
+        return result | {"to_world": self._transform(matrix), "flip_normals": flip}
+
+    # --- materials -----------------------------------------------------------------------------------------------
+
+    def _bsdf(self, reference):
+        bsdf = resolve_bsdf(self.scene, reference)
+        if isinstance(bsdf, description.TwoSided):
+            front = self._bsdf(bsdf.front)
+            return {"type": "twosided", "front": front, "back": front if bsdf.back is None else self._bsdf(bsdf.back)}
+        if isinstance(bsdf, description.Mask):
+            opacity = self._parameter(bsdf.opacity, scalar=True)
+            return {"type": "mask", "opacity": opacity, "nested": self._bsdf(bsdf.bsdf)}
+        if isinstance(bsdf, description.Diffuse):
+            return {"type": "diffuse", "reflectance": self._parameter(bsdf.reflectance)}
+        rough = isinstance(bsdf, (description.RoughConductor, description.RoughDielectric))
+        result = {"specular_reflectance": self._parameter(bsdf.specular_reflectance)}
+        if rough:
+            result |= {"distribution": bsdf.distribution, "alpha": self._parameter(bsdf.alpha, scalar=True)}
+        if isinstance(bsdf, (description.Conductor, description.RoughConductor)):
+            result["type"] = "roughconductor" if rough else "conductor"
+            if bsdf.material is not None:
+                return result | {"material": bsdf.material}
+            eta, k = (0.0, 1.0) if bsdf.eta is None else (bsdf.eta, bsdf.k)  # a perfect mirror
+            return result | {"eta": self._parameter(eta), "k": self._parameter(k)}
+        return result | {
+            "type": "roughdielectric" if rough else "dielectric",
+            "int_ior": bsdf.int_ior,
+            "ext_ior": bsdf.ext_ior,
+            "specular_transmittance": self._parameter(bsdf.specular_transmittance),
+        }
+
+    def _parameter(self, value, scalar=False):
+        value = resolve_texture(self.scene, value)
+        if isinstance(value, description.Checkerboard):
+            return {
+                "type": "checkerboard",
+                "color0": _colour(value.color0),
+                "color1": _colour(value.color1),
+                "to_uv": self._uv_transform(value),
+            }
+        if isinstance(value, description.Bitmap):
+            return self._bitmap(value, scalar)
+        return float(value) if scalar else _colour(value)
+
+    def _bitmap(self, bitmap, scalar):
+        is_float = bitmap.file.lower().endswith(".exr")
+        if is_float and bitmap.color_space == "srgb":
+            raise WavefrontError(f"{bitmap.file}: Mitsuba takes no OpenEXR image as sRGB")
+        linear = bitmap.color_space == "linear" or (bitmap.color_space == "auto" and (scalar or is_float))
+        return {
+            "type": "bitmap",
+            "filename": bitmap.file,
+            "raw": linear,
+            "filter_type": bitmap.filter,
+            "wrap_mode": bitmap.wrap,
+            "to_uv": self._uv_transform(bitmap),
+        }
+
+    def _uv_transform(self, texture):
+        (a, b, c), (d, e, f) = texture.uv_transform
+        return self._transform([[a, b, 0.0, c], [d, e, 0.0, f], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+def integrator_spp(scene: description.Scene) -> int:
+    return scene.integrator.spp
+
+
+def _colour(value):
+    return {"type": "rgb", "value": [float(channel) for channel in np.broadcast_to(value, 3)]}
