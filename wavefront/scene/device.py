@@ -16,7 +16,7 @@ from wavefront.scene import description
 from wavefront.scene.images import load_image
 from wavefront.scene.ior import CONDUCTORS, INDEX_OF_REFRACTION
 from wavefront.scene.lookup import resolve_bsdf, resolve_texture
-from wavefront.scene.meshes import tessellate
+from wavefront.scene.meshes import clear_cache, tessellate
 from wavefront.scene.transforms import to_matrix
 from wavefront.texture import WRAP_MODES, TextureRecord, TextureTables, srgb_to_linear
 
@@ -276,6 +276,7 @@ class _Upload:
                     self.notes.append(f"{where}: {mesh.dropped} triangles without area are left out")
                 record["smooth"] = int(mesh.normals is not None)
                 meshes.append((record, mesh, emitter))
+        clear_cache()
         return meshes, spheres
 
     def _upload_geometry(self, meshes, spheres) -> tuple[Geometry, np.ndarray]:

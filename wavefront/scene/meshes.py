@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,10 +11,8 @@ import numpy as np
 from wavefront.errors import SceneError
 from wavefront.scene import description
 from wavefront.scene.images import replacing
-from wavefront.scene.mesh_files import clear_cache, read_mesh
 from wavefront.scene.transforms import is_mirror, to_matrix
 
-__all__ = ["TriangleMesh", "clear_cache", "tessellate", "write_ply"]
 
 DISK_SEGMENTS = 256
 
@@ -96,7 +95,20 @@ def tessellate(shape: description.AnyShape, where: str = "") -> TriangleMesh:
 
 def has_file_normals(path: str, where: str = "") -> bool:
     """Whether a mesh file has vertex normals. Raises SceneError as `tessellate` does."""
-    return read_mesh(path, where).normals is not None
+    return _read_mesh(path, where).normals is not None
+
+
+def clear_cache() -> None:
+    """Lets go of the mesh files that are remembered for the next use."""
+    if mesh_files := sys.modules.get("wavefront.scene.mesh_files"):
+        mesh_files.clear_cache()
+
+
+def _read_mesh(path, where):
+    # Imported here, since trimesh takes most of a second to import and scenes without mesh files need none of it.
+    from wavefront.scene.mesh_files import read_mesh
+
+    return read_mesh(path, where)
 
 
 # --- meshes ----------------------------------------------------------------------------------------------------
@@ -122,7 +134,7 @@ def _mesh_arrays(shape, where):
             if getattr(shape, name) is not None:
                 raise SceneError(f"{name} are for inline vertices; the file has its own", path=f"{where}.{name}")
         source = f"{where}.file"
-        data = read_mesh(shape.file, source)
+        data = _read_mesh(shape.file, source)
         vertices, faces, normals, uvs = data.vertices, data.faces, data.normals, data.uvs
         names = dict.fromkeys(("vertices", "faces", "normals", "uvs"), source)
         where = source

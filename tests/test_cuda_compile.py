@@ -1,0 +1,77 @@
+"""Every kernel compiles for CUDA, which needs a CUDA compiler (Warp brings one) but no GPU."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import warp as wp
+
+from wavefront.features import Features
+from wavefront.integrator import make_kernels
+
+CORNELL_BOX = Features(
+    triangles=True,
+    spheres=False,
+    smooth=False,
+    uvs=False,
+    bsdfs=("diffuse",),
+    mask=False,
+    textures=(),
+    lights=("triangle",),
+    light_textures=(),
+    nee=True,
+    roulette=True,
+    filter="box",
+    aovs=(),
+    variance=False,
+)
+EVERYTHING = Features(
+    triangles=True,
+    spheres=True,
+    smooth=True,
+    uvs=True,
+    bsdfs=("conductor", "dielectric", "diffuse", "rough_conductor", "rough_dielectric"),
+    mask=True,
+    textures=("bytes", "checkerboard", "floats"),
+    lights=("constant", "sphere", "triangle"),
+    light_textures=("bytes", "checkerboard", "floats"),
+    nee=True,
+    roulette=True,
+    filter="gaussian",
+    aovs=("albedo", "depth", "normal"),
+    variance=True,
+)
+CHANGES = [
+    {},
+    {"triangles": False, "lights": ("sphere",)},
+    {"spheres": False, "lights": ("triangle",)},
+    {"textures": (), "light_textures": (), "uvs": False, "lights": ("constant",)},
+    {"nee": False, "filter": "tent", "mask": False},
+    {"bsdfs": ("conductor",), "roulette": False, "filter": "box"},
+    {"bsdfs": ("dielectric",), "aovs": ("albedo",), "variance": False},
+]
+
+
+def compile_for_cuda(features: Features, arch: int, folder) -> int:
+    """Compiles all stages for `arch`, writes PTX or CUBIN to `folder`, and returns the number of modules."""
+    modules = make_kernels(features).modules()
+    for module in modules:
+        wp.compile_aot_module(module, arch=arch, module_dir=str(folder))
+    return len(modules)
+
+
+def test_one_feature_set_compiles_for_cuda(tmp_path):
+    count = compile_for_cuda(CORNELL_BOX, 90, tmp_path)
+    built = [path for path in tmp_path.iterdir() if path.suffix in (".ptx", ".cubin")]
+    assert len(built) == count == 9
+    assert all(path.stat().st_size > 500 for path in built)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arch", [80, 90])
+@pytest.mark.parametrize("change", range(len(CHANGES)))
+def test_all_feature_sets_compile_for_cuda(tmp_path, arch, change):
+    features = dataclasses.replace(EVERYTHING, **CHANGES[change])
+    count = compile_for_cuda(features, arch, tmp_path)
+    assert len([path for path in tmp_path.iterdir() if path.suffix in (".ptx", ".cubin")]) == count
