@@ -100,3 +100,17 @@ def test_memory_budget_bounds_the_path_state():
     large = wavefront.Renderer(lit_floor(), threads=2)
     assert small.capacity < large.capacity
     np.testing.assert_array_equal(small.render(spp=200), large.render(spp=200))
+
+
+def test_objects_are_checked_as_a_file_is():
+    scene = lit_floor()
+    scene.shapes[0].bsdf.reflectance = 1.5
+    with pytest.raises(wavefront.SceneError, match=r"^shapes\[0\]\.bsdf\.reflectance: .*1\.5"):
+        wavefront.Renderer(scene)
+
+
+def test_a_renderer_keeps_its_scene():
+    scene = lit_floor()
+    renderer = wavefront.Renderer(scene)
+    scene.film.width = 99
+    assert renderer.render(spp=1).shape == (12, 16, 3)

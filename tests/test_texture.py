@@ -94,7 +94,9 @@ def linear_pixels(name, srgb):
 def oracle(name, uv, srgb, nearest, mode):
     pixels = linear_pixels(name, srgb)
     height, width, _ = pixels.shape
-    x, y = uv[:, 0].astype(np.float64) * width, uv[:, 1].astype(np.float64) * height
+    # Two periods taken off, exactly, so that the pixel fits an integer.
+    uv = np.clip(uv.astype(np.float64), -9.0, 9.0) if mode == "clamp" else np.mod(uv.astype(np.float64), 2.0)
+    x, y = uv[:, 0] * width, uv[:, 1] * height
 
     def fetch(i, j):
         return pixels[wrapped(j, height, mode), wrapped(i, width, mode)]

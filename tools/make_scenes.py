@@ -98,12 +98,16 @@ def cornell_box() -> Scene:
 
 
 def furnace() -> Scene:
-    """What is reflected equals what would be seen without the sphere, so that it cannot be told apart."""
+    """What is reflected equals what would be seen without the sphere, so that it cannot be told apart.
+
+    Without next-event estimation each path has the weight 1 and ends in the environment: there is no noise at all.
+    """
     return Scene(
-        description="White furnace: a sphere that absorbs nothing, in an environment of radiance 1. Every pixel is 1.",
+        description="White furnace: a sphere that absorbs nothing, in an environment of radiance 1. Every pixel is 1, "
+        "whatever the number of samples; with next-event estimation on, that is the mean.",
         camera=Perspective(fov=30.0, to_world=look_at((0, 0, 5), (0, 0, 0))),
         film=film(),
-        integrator=PathIntegrator(max_depth=8, rr_depth=None),
+        integrator=PathIntegrator(max_depth=8, rr_depth=None, nee=False),
         emitters=[Constant(radiance=1.0)],
         shapes=[Sphere(name="sphere", bsdf=Diffuse(reflectance=1.0))],
     )

@@ -25,6 +25,7 @@ from wavefront.integrator import (
 from wavefront.queues import TOTAL_PATHS, TOTAL_RAYS, TOTAL_SHADOW_RAYS
 from wavefront.scene.description import Scene
 from wavefront.scene.device import upload_scene
+from wavefront.scene.json_format import checked
 from wavefront.scene.validate import validate
 
 CPU_CAPACITY = 1 << 14  # paths in flight per worker: their state stays in a core's second-level cache
@@ -97,6 +98,7 @@ class Renderer:
             raise WavefrontError(f"seed {seed} is out of range; allowed: 0 to 2^64 - 1")
         if threads is not None and threads < 1:
             raise WavefrontError(f"{threads} threads; allowed: 1 or more")
+        scene = checked(scene)  # a scene built in Python gets the checks that a file gets, and a copy is kept
         self.warnings = validate(scene)
         self.scene, self.device, self.seed = scene, resolve_device(device), seed
         self.device_scene = upload_scene(scene, self.device)

@@ -74,6 +74,7 @@ def test_the_furnace_has_nothing_but_a_white_sphere_in_an_even_light():
     assert scene.shapes == [d.Sphere(name="sphere", bsdf=d.Diffuse(reflectance=1.0))]
     assert scene.emitters == [d.Constant(radiance=1.0)]
     assert scene.integrator.rr_depth is None
+    assert not scene.integrator.nee  # with it, two estimates of 1 are combined, which is 1 in the mean only
 
 
 def test_every_glossy_plate_mirrors_the_row_of_lights_to_the_camera():

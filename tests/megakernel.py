@@ -1,0 +1,176 @@
+"""A path tracer in one kernel: a plain loop over bounces per path, the oracle for the stages and their queues.
+
+It shares the functions of BSDFs, lights and geometry, which have tests of their own, and the random numbers, so that
+it follows the same paths. What it does not share is everything the stages do: slots, queues, depth, weights, roulette,
+who adds what and when. Its kernel knows every material and light, whether a scene has them or not, so a renderer whose
+features leave out too much differs from it.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import warp as wp
+
+from wavefront.accel.mesh_query import Geometry, make_intersector
+from wavefront.bsdf.dispatch import is_smooth, make_bsdf
+from wavefront.bsdf.tables import KINDS as BSDF_KINDS
+from wavefront.bsdf.tables import MaterialTables
+from wavefront.camera import Camera, camera_ray, make_camera
+from wavefront.light.sampling import make_light_sampler
+from wavefront.light.tables import KINDS as LIGHT_KINDS
+from wavefront.light.tables import LightTables
+from wavefront.renderer import Renderer
+from wavefront.rng import PURPOSE_BSDF, PURPOSE_CAMERA, PURPOSE_LIGHT, uniform4
+from wavefront.surface import make_vertex, spawn_origin
+from wavefront.texture import TextureTables, make_eval_parameter
+from wavefront.warp_samples import square_to_gaussian, square_to_tent
+
+TEXTURES = ("bytes", "checkerboard", "floats")
+BOX, TENT, GAUSSIAN = wp.constant(0), wp.constant(1), wp.constant(2)
+FILTERS = {"box": 0, "tent": 1, "gaussian": 2}
+
+
+@wp.struct
+class Settings:
+    width: wp.int32
+    samples: wp.int32
+    first_sample: wp.int32
+    max_depth: wp.int32
+    rr_depth: wp.int32  # 2^30: never
+    nee: wp.int32
+    filter: wp.int32
+    filter_scale: wp.float32
+    seed: wp.uint64
+
+
+@functools.cache
+def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
+    """Only what a scene lacks memory for is left out: kinds of primitive, vertex normals and UVs."""
+    closest_hit, occluded = make_intersector(triangles, spheres)
+    vertex_of = make_vertex(triangles, spheres, smooth, uvs)
+    eval_bsdf, sample_bsdf, _ = make_bsdf(tuple(sorted(BSDF_KINDS)), True, TEXTURES)
+    sample_light, light_pdf = make_light_sampler(tuple(sorted(LIGHT_KINDS)), TEXTURES)
+    eval_parameter = make_eval_parameter(TEXTURES)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def trace_paths(
+        camera: Camera,
+        geometry: Geometry,
+        materials: MaterialTables,
+        textures: TextureTables,
+        lights: LightTables,
+        settings: Settings,
+        # out
+        result: wp.array[wp.vec3],
+    ):
+        i = wp.tid()
+        pixel = i // settings.samples
+        key = wp.uint32(pixel)
+        sample = wp.uint32(settings.first_sample + i % settings.samples)
+        seed = settings.seed
+
+        u = uniform4(seed, key, sample, 0, PURPOSE_CAMERA)
+        shift = wp.vec2(u[0], u[1]) - wp.vec2(0.5, 0.5)
+        if settings.filter == TENT:
+            shift = settings.filter_scale * square_to_tent(wp.vec2(u[0], u[1]))
+        if settings.filter == GAUSSIAN:
+            shift = settings.filter_scale * square_to_gaussian(wp.vec2(u[0], u[1]))
+        x = float(pixel % settings.width) + 0.5 + shift[0]
+        y = float(pixel // settings.width) + 0.5 + shift[1]
+        origin = camera.origin
+        direction = camera_ray(camera, x, y)
+
+        L = wp.vec3(0.0)
+        beta = wp.vec3(1.0)
+        bsdf_pdf = float(0.0)
+        medium = float(1.0)  # index of refraction relative to the camera's
+        for segment in range(1, settings.max_depth + 1):
+            hit = closest_hit(geometry, origin, direction)
+            if hit.primitive < 0:
+                if lights.environment >= 0:
+                    sky = lights.lights[lights.environment]
+                    w = float(1.0)
+                    if settings.nee == 1 and bsdf_pdf > 0.0:
+                        a = bsdf_pdf
+                        b = sky.pmf / wp.static(4.0 * wp.pi)
+                        w = a * a / (a * a + b * b)
+                    L += w * wp.cw_mul(beta, lights.emitters[sky.emitter].radiance)
+                break
+            vertex = vertex_of(geometry, origin, direction, hit)
+            shape = geometry.shapes[geometry.shape_of[hit.primitive]]
+            if shape.first_light >= 0 and wp.dot(vertex.geometric_normal, direction) < 0.0:
+                index = shape.first_light + hit.primitive - shape.first_primitive
+                emitter = lights.emitters[lights.lights[index].emitter]
+                w = float(1.0)
+                if settings.nee == 1 and bsdf_pdf > 0.0:
+                    b = light_pdf(
+                        lights, geometry, index, origin, direction, vertex.position, vertex.geometric_normal
+                    )
+                    ratio = b / bsdf_pdf
+                    w = 1.0 / (1.0 + ratio * ratio)
+                Le = eval_parameter(textures, emitter.radiance, emitter.radiance_texture, vertex.uv)
+                L += w * wp.cw_mul(beta, Le)
+            if segment == settings.max_depth:
+                break
+
+            wo = -direction
+            normal = vertex.shading_normal
+            facing = is_smooth(materials.materials[shape.material], wp.dot(normal, wo))
+            if settings.nee == 1 and facing and lights.lights.shape[0] > 0:
+                u = uniform4(seed, key, sample, segment - 1, PURPOSE_LIGHT)
+                light = sample_light(lights, geometry, textures, vertex.position, wp.vec3(u[0], u[1], u[2]))
+                if wp.max(light.L) > 0.0:
+                    f = eval_bsdf(materials, textures, shape.material, vertex.uv, normal, wo, light.wi)
+                    if wp.max(f.value) > 0.0:
+                        start = spawn_origin(vertex.position, vertex.geometric_normal, vertex.offset, light.wi)
+                        to_light = light.wi
+                        if light.t_max == 1.0:
+                            to_light = light.target - start
+                        if not occluded(geometry, start, to_light, light.t_max):
+                            ratio = f.pdf / light.pdf
+                            w = 1.0 / (1.0 + ratio * ratio)
+                            L += (w / light.pdf) * wp.cw_mul(beta, wp.cw_mul(f.value, light.L))
+
+            u = uniform4(seed, key, sample, segment - 1, PURPOSE_BSDF)
+            s = sample_bsdf(
+                materials, textures, shape.material, vertex.uv, normal, wo, wp.vec3(u[0], u[1], u[2])
+            )
+            beta = wp.cw_mul(beta, s.weight)
+            if not wp.max(beta) > 0.0:
+                break
+            medium *= s.eta
+            if segment >= settings.rr_depth:
+                q = wp.min(0.95, wp.max(beta) * medium * medium)
+                if u[3] >= q:
+                    break
+                beta = beta / q
+            direction = wp.normalize(s.wi)
+            origin = spawn_origin(vertex.position, vertex.geometric_normal, vertex.offset, direction)
+            bsdf_pdf = s.pdf
+        result[i] = L
+
+    return trace_paths
+
+
+def render_megakernel(renderer: Renderer, spp: int) -> np.ndarray:
+    """The image that `renderer.render(spp)` should give, from its uploaded scene; float64, [height, width, 3]."""
+    scene, device_scene, f = renderer.scene, renderer.device_scene, renderer.features
+    film, integrator = scene.film, scene.integrator
+    settings = Settings()
+    settings.width, settings.samples, settings.first_sample = film.width, spp, 0
+    settings.max_depth, settings.nee = integrator.max_depth, int(integrator.nee)
+    settings.rr_depth = 2**30 if integrator.rr_depth is None else integrator.rr_depth
+    kind = film.filter.__struct_config__.tag
+    settings.filter = FILTERS[kind]
+    settings.filter_scale = {"box": 0.5}.get(kind) or getattr(film.filter, "radius", 0.0) or film.filter.stddev
+    settings.seed = renderer.seed
+    n = film.width * film.height * spp
+    result = wp.zeros(n, dtype=wp.vec3, device="cpu")
+    kernel = make_megakernel(f.triangles, f.spheres, f.smooth, f.uvs)
+    d = device_scene
+    inputs = [make_camera(scene.camera, film), d.geometry, d.materials, d.textures, d.lights, settings]
+    wp.launch(kernel, dim=n, inputs=inputs, outputs=[result], device="cpu")
+    samples = result.numpy().astype(np.float64).reshape(film.height, film.width, spp, 3)
+    return samples.sum(axis=2) / spp

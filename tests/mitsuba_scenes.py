@@ -1,0 +1,237 @@
+"""Small Mitsuba XML scenes: one per BSDF, texture mode and emitter, for the comparison of images.
+
+A scene is a floor, a lamp and a subject. Scenes of one *family* have the same features (kinds of BSDF, texture, light
+and geometry), so that their kernels are compiled once: what a scene does not show lies in a corner that hardly sends
+any light to the camera, as `EVERYTHING`. They are small, short-pathed and without sharp highlights, so that a second of
+rendering finds a difference of half a percent.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+SIZE = 32  # pixels of a side
+MAX_DEPTH = 5
+
+_SCENE = """<scene version="{version}">
+  <integrator type="path"><integer name="max_depth" value="{depth}"/><integer name="rr_depth" value="1000"/></integrator>
+  <sensor type="perspective">
+    <float name="fov" value="34"/>{camera}
+    <transform name="to_world"><lookat origin="0, 2.4, 6" target="0, 0.75, 0" up="0, 1, 0"/></transform>
+    <film type="hdrfilm">
+      <integer name="width" value="{width}"/><integer name="height" value="{height}"/><rfilter type="box"/>
+    </film>
+  </sensor>
+  {body}
+</scene>
+"""
+
+FLOOR = """<shape type="rectangle">
+    <transform name="to_world"><scale value="4"/><rotate x="1" angle="-90"/></transform>
+    <bsdf type="diffuse"><rgb name="reflectance" value="0.5, 0.45, 0.4"/></bsdf>
+  </shape>"""
+
+LAMP = """<shape type="rectangle">
+    <transform name="to_world">
+      <scale value="0.8"/><rotate x="1" angle="90"/><translate x="-0.6" y="4" z="1"/>
+    </transform>
+    <emitter type="area"><rgb name="radiance" value="12, 11, 10"/></emitter>
+  </shape>"""
+
+SKY = """<emitter type="constant"><rgb name="radiance" value="0.5, 0.6, 0.8"/></emitter>"""
+
+
+def ball(bsdf: str) -> str:
+    """A sphere on the floor."""
+    return f'<shape type="sphere"><point name="center" x="0" y="1" z="0"/>{bsdf}</shape>'
+
+
+def panel(bsdf: str, angle: float = -50.0) -> str:
+    """A tilted square above the floor; by more than 90 degrees it shows its back."""
+    return f"""<shape type="rectangle">
+    <transform name="to_world"><scale value="1.1"/><rotate x="1" angle="{angle}"/><translate y="1"/></transform>
+    {bsdf}
+  </shape>"""
+
+
+def _speck(bsdf: str, x: float, emitter: str = "", shape: str = "rectangle") -> str:
+    """A square or a ball of a millimetre, behind the camera."""
+    return f"""<shape type="{shape}">
+    <transform name="to_world"><scale value="0.001"/><translate x="{x}" y="1" z="9"/></transform>{bsdf}{emitter}
+  </shape>"""
+
+
+METAL = '<rgb name="eta" value="0.2, 0.9, 1.1"/><rgb name="k" value="3.9, 2.4, 2.2"/>'
+EVERYTHING = "\n  ".join(
+    [
+        _speck(
+            '<bsdf type="mask"><float name="opacity" value="0.5"/>'
+            '<bsdf type="diffuse"><texture name="reflectance" type="bitmap">'
+            '<string name="filename" value="texture.png"/></texture></bsdf></bsdf>',
+            0.0,
+        ),
+        _speck('<bsdf type="diffuse"><texture name="reflectance" type="checkerboard"/></bsdf>', 0.1),
+        _speck('<bsdf type="conductor"><string name="material" value="Cu"/></bsdf>', 0.2),
+        _speck(f'<bsdf type="roughconductor">{METAL}</bsdf>', 0.3),
+        _speck('<bsdf type="dielectric"/>', 0.4),
+        _speck('<bsdf type="roughdielectric"/>', 0.5),
+        _speck("", 0.6, '<emitter type="area"><rgb name="radiance" value="1"/></emitter>'),
+        _speck("", 0.7, '<emitter type="area"><rgb name="radiance" value="1"/></emitter>', "sphere"),
+    ]
+)
+
+
+def document(body: list[str], everything: bool, version: str = "3.0.0", camera: str = "", size=(SIZE, SIZE)) -> str:
+    """The XML text of a scene.
+
+    Args:
+        body: Its shapes and emitters.
+        everything: Whether to add `EVERYTHING`, which also needs a constant emitter and the file ``texture.png``.
+        version: Dialect.
+        camera: Further elements of the sensor.
+        size: Width and height, pixels.
+    """
+    parts = [*body, EVERYTHING] if everything else body
+    return _SCENE.format(
+        version=version, depth=MAX_DEPTH, camera=camera, width=size[0], height=size[1], body="\n  ".join(parts)
+    )
+
+
+def _texture(parameter: str, wrap: str = "repeat", scale: float = 2.6, raw: bool = False) -> str:
+    return f"""<texture name="{parameter}" type="bitmap">
+      <string name="filename" value="{"opacity" if parameter == "opacity" else "texture"}.png"/>
+      <string name="wrap_mode" value="{wrap}"/><boolean name="raw" value="{str(raw).lower()}"/>
+      <transform name="to_uv"><scale x="{scale}" y="{0.7 * scale}"/><translate x="-0.35" y="-0.2"/></transform>
+    </texture>"""
+
+
+_PAINT = '<bsdf type="diffuse"><rgb name="reflectance" value="{}"/></bsdf>'
+_GLASS = '<float name="int_ior" value="1.5"/><float name="ext_ior" value="1"/>'
+_CHECKS = """<texture name="reflectance" type="checkerboard">
+      <rgb name="color0" value="0.9, 0.6, 0.1"/><rgb name="color1" value="0.1, 0.2, 0.5"/>
+      <transform name="to_uv"><scale x="3" y="2"/></transform>
+    </texture>"""
+
+
+def _rough(kind: str, distribution: str, alpha: float, rest: str) -> str:
+    return f"""<bsdf type="{kind}">
+      <string name="distribution" value="{distribution}"/><float name="alpha" value="{alpha}"/>{rest}
+    </bsdf>"""
+
+
+_TWO_SIDES = f'<bsdf type="twosided">{_PAINT.format("0.8, 0.2, 0.1")}{_PAINT.format("0.1, 0.3, 0.8")}</bsdf>'
+
+# Diffuse surfaces and triangles alone: the kernels of a plain scene.
+PLAIN: dict[str, list[str]] = {
+    "diffuse": [FLOOR, LAMP, panel(_PAINT.format("0.8, 0.3, 0.2"))],
+    "two sides, the front": [FLOOR, LAMP, panel(_TWO_SIDES)],
+    "two sides, the back": [FLOOR, LAMP, panel(_TWO_SIDES, 130.0)],
+    "one side, the back": [FLOOR, LAMP, panel(_PAINT.format("0.8, 0.3, 0.2"), 130.0)],
+    "smooth mesh": [
+        FLOOR,
+        LAMP,
+        f"""<shape type="obj"><string name="filename" value="ball.obj"/>
+    <transform name="to_world"><translate y="1"/></transform>{_PAINT.format("0.3, 0.6, 0.7")}</shape>""",
+    ],
+    "flat mesh": [
+        FLOOR,
+        LAMP,
+        f"""<shape type="obj"><string name="filename" value="ball.obj"/><boolean name="face_normals" value="true"/>
+    <transform name="to_world"><translate y="1"/></transform>{_PAINT.format("0.3, 0.6, 0.7")}</shape>""",
+    ],
+    "mesh light": [
+        FLOOR,
+        # Flat: where normals are interpolated, Mitsuba converts areas to solid angles by the shading normal, which is not
+        # the measure that it samples, and its image depends on the share of light samples.
+        """<shape type="obj"><string name="filename" value="ball.obj"/><boolean name="face_normals" value="true"/>
+    <transform name="to_world"><scale value="0.7"/><translate x="-0.4" y="1.8" z="0.3"/></transform>
+    <emitter type="area"><rgb name="radiance" value="3, 4, 5"/></emitter></shape>""",
+    ],
+    "cube and disk": [
+        FLOOR,
+        LAMP,
+        f"""<shape type="cube"><transform name="to_world"><scale value="0.6"/><rotate y="1" angle="30"/>
+    <translate x="-0.9" y="0.6"/></transform>{_PAINT.format("0.7, 0.7, 0.2")}</shape>""",
+        f"""<shape type="disk"><transform name="to_world"><scale value="0.8"/><rotate x="1" angle="-40"/>
+    <translate x="0.9" y="0.8"/></transform>{_PAINT.format("0.2, 0.7, 0.3")}</shape>""",
+    ],
+}
+
+# The kernels of a scene with all kinds of everything.
+MIXED: dict[str, list[str]] = {
+    "conductor": [FLOOR, LAMP, SKY, ball('<bsdf type="conductor"><string name="material" value="Au"/></bsdf>')],
+    "rough conductor, GGX": [FLOOR, LAMP, SKY, ball(_rough("roughconductor", "ggx", 0.4, METAL))],
+    "rough conductor, Beckmann": [FLOOR, LAMP, SKY, ball(_rough("roughconductor", "beckmann", 0.3, METAL))],
+    "dielectric": [FLOOR, SKY, ball(f'<bsdf type="dielectric">{_GLASS}</bsdf>')],
+    "rough dielectric, GGX": [FLOOR, SKY, ball(_rough("roughdielectric", "ggx", 0.3, _GLASS))],
+    "rough dielectric, Beckmann": [FLOOR, SKY, ball(_rough("roughdielectric", "beckmann", 0.3, _GLASS))],
+    "opacity": [
+        FLOOR,
+        LAMP,
+        SKY,
+        panel(
+            f'<bsdf type="mask"><float name="opacity" value="0.3"/><bsdf type="twosided">'
+            f"{_PAINT.format('0.8, 0.3, 0.2')}</bsdf></bsdf>"
+        ),
+    ],
+    "opacity bitmap": [
+        FLOOR,
+        LAMP,
+        SKY,
+        panel(f'<bsdf type="mask">{_texture("opacity", raw=True)}{_PAINT.format("0.8, 0.3, 0.2")}</bsdf>'),
+    ],
+    "bitmap, repeat": [FLOOR, LAMP, SKY, panel(f'<bsdf type="diffuse">{_texture("reflectance")}</bsdf>')],
+    "bitmap, mirror": [FLOOR, LAMP, SKY, panel(f'<bsdf type="diffuse">{_texture("reflectance", "mirror")}</bsdf>')],
+    "bitmap, clamp": [FLOOR, LAMP, SKY, panel(f'<bsdf type="diffuse">{_texture("reflectance", "clamp")}</bsdf>')],
+    "bitmap on a ball": [FLOOR, LAMP, SKY, ball(f'<bsdf type="diffuse">{_texture("reflectance")}</bsdf>')],
+    "checkerboard": [FLOOR, LAMP, SKY, panel(f'<bsdf type="diffuse">{_CHECKS}</bsdf>')],
+    "sky": [FLOOR, SKY, ball(_PAINT.format("0.7, 0.7, 0.2"))],
+    "sphere light": [
+        FLOOR,
+        SKY,
+        """<shape type="sphere"><point name="center" x="-0.4" y="1.8" z="0.3"/><float name="radius" value="0.5"/>
+    <emitter type="area"><rgb name="radiance" value="6, 7, 8"/></emitter></shape>""",
+    ],
+}
+
+# Elements of the sensor, and the size of the film.
+CAMERAS: dict[str, tuple[str, tuple[int, int]]] = {
+    axis: (f'<string name="fov_axis" value="{axis}"/>', size)
+    for axis, size in (("x", (48, 24)), ("y", (48, 24)), ("diagonal", (48, 24)), ("smaller", (24, 48)), ("larger", (24, 48)))
+}
+
+
+def write_files(folder: Path) -> None:
+    """Writes the mesh and the images that the scenes refer to."""
+    rng = np.random.default_rng(1)
+    texture = rng.integers(20, 250, (5, 7, 3), dtype=np.uint8)
+    Image.fromarray(texture).save(folder / "texture.png")
+    Image.fromarray(rng.integers(0, 255, (4, 6), dtype=np.uint8)).save(folder / "opacity.png")
+    (folder / "ball.obj").write_text(_ball_obj(8, 12), encoding="utf-8")
+
+
+def _ball_obj(rings: int, sectors: int) -> str:
+    """A unit ball of few triangles with smooth normals that are not quite those of the sphere."""
+    lines, faces = [], []
+    for i in range(rings + 1):
+        for j in range(sectors + 1):
+            theta, phi = np.pi * i / rings, 2.0 * np.pi * j / sectors
+            p = np.array([np.sin(theta) * np.cos(phi), np.cos(theta), -np.sin(theta) * np.sin(phi)])
+            n = p * (1.0, 1.2, 1.0) / np.linalg.norm(p * (1.0, 1.2, 1.0))
+            lines += [
+                "v {:.6f} {:.6f} {:.6f}".format(*p),
+                f"vt {j / sectors:.6f} {1.0 - i / rings:.6f}",
+                "vn {:.6f} {:.6f} {:.6f}".format(*n),
+            ]
+    for i in range(rings):
+        for j in range(sectors):
+            a, b = i * (sectors + 1) + j + 1, (i + 1) * (sectors + 1) + j + 1
+            if i > 0:
+                faces.append((a, b, a + 1))
+            if i < rings - 1:
+                faces.append((a + 1, b, b + 1))
+    lines += [f"f {' '.join(f'{k}/{k}/{k}' for k in face)}" for face in faces]
+    return "\n".join(lines) + "\n"
