@@ -163,40 +163,44 @@ class Worker:
             allocate_struct(struct, capacity, device, skip[struct]) for struct in (Paths, Surfaces, ShadowRays)
         )
         self.paths, self.surfaces, self.shadow_rays = paths, surfaces, shadow_rays
-        d, q = device_scene, self.queues
-        counters, totals = q.counters, q.totals
-        seed = wp.uint64(seed)
-        width = film.width
-        scale = FILTER_SCALES[features.filter](scene.film.filter)
+        geometry, materials = device_scene.geometry, device_scene.materials
+        textures, lights = device_scene.textures, device_scene.lights
+        rays, hits, escaped, emissive, shadow = (self.queues[name] for name in QueueSet.INDEX)
+        counters, totals, tile = self.queues.counters, self.queues.totals, self.tile
         camera = make_camera(scene.camera, scene.film)
-        integrator = scene.integrator
-        rays, hits = q["rays"], q["hits"]
+        scale = FILTER_SCALES[features.filter](scene.film.filter)
+        max_depth, rr_depth = scene.integrator.max_depth, scene.integrator.rr_depth or 0
+        width, sums, seed = film.width, film.arrays, wp.uint64(seed)
+        # In the order of the kernels' parameters.
         arguments = {
-            "generate": [camera, self.tile, width, scale, seed, paths, rays, counters, totals],
-            "intersect": [
-                *(d.geometry, paths, rays, integrator.max_depth),
-                *(surfaces, hits, q["escaped"], q["emissive"], counters),
-            ],
-            "escaped": [d.lights, paths, q["escaped"], counters],
-            "emission": [d.geometry, d.lights, d.textures, paths, surfaces, q["emissive"], counters],
-            "aov": [d.materials, d.textures, paths, surfaces, self.tile, width, film.arrays],
+            "generate": [camera, tile, width, scale, seed, paths, rays, counters, totals],
+            "intersect": [geometry, paths, rays, max_depth, surfaces, hits, escaped, emissive, counters],
+            "escaped": [lights, paths, escaped, counters],
+            "emission": [geometry, lights, textures, paths, surfaces, emissive, counters],
+            "aov": [materials, textures, paths, surfaces, tile, width, sums],
             "direct": [
-                *(d.geometry, d.materials, d.textures, d.lights, paths, surfaces, hits, seed),
-                *(shadow_rays, q["shadow"], counters),
-            ],
-            "shadow": [d.geometry, shadow_rays, q["shadow"], paths],
+                geometry,
+                materials,
+                textures,
+                lights,
+                paths,
+                surfaces,
+                hits,
+                seed,
+                shadow_rays,
+                shadow,
+                counters,
+            ],  # fmt: skip
+            "shadow": [geometry, shadow_rays, shadow, paths],
             "drain": [counters, totals],
-            "scatter": [
-                *(d.materials, d.textures, surfaces, hits, integrator.rr_depth or 0, seed),
-                *(paths, rays, counters),
-            ],
+            "scatter": [materials, textures, surfaces, hits, rr_depth, seed, paths, rays, counters],
             "advance": [counters],
-            "accumulate": [paths, self.tile, width, film.arrays],
+            "accumulate": [paths, tile, width, sums],
         }
         self.commands = {
             stage: wp.launch(kernel, dim=capacity, inputs=arguments[stage], device=device, record_cmd=True)
-            for stage, kernel in ((name, getattr(kernels, name)) for name in arguments)
-            if kernel is not None
+            for stage in arguments
+            if (kernel := getattr(kernels, stage)) is not None
         }
         self._arguments = arguments  # recorded commands do not keep their arrays alive
 
@@ -245,7 +249,7 @@ class Worker:
         self._launch("advance", 1)
 
     def _launch(self, stage: str, size: str | int) -> None:
-        """Launches a stage over a queue, or over a number of threads. The CPU device launches no more than is queued."""
+        """Launches a stage over a queue, or over a number of threads; on the CPU device no more than is queued."""
         command = self.commands.get(stage)
         if command is None:
             return

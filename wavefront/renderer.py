@@ -118,8 +118,15 @@ class Renderer:
         self.film = Film(film.width, film.height, aovs, self.device)
         self.workers = [
             Worker(
-                *(scene, self.device_scene, self.features, self.kernels, self.film, seed),
-                *(self.capacity, self.device, profile),
+                scene=scene,
+                device_scene=self.device_scene,
+                features=self.features,
+                kernels=self.kernels,
+                film=self.film,
+                seed=seed,
+                capacity=self.capacity,
+                device=self.device,
+                profile=profile,
             )
             for _ in range(self.threads)
         ]

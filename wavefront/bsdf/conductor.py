@@ -7,9 +7,7 @@ from wavefront.bsdf.record import BsdfSample, no_sample
 
 
 @wp.func
-def sample_conductor(
-    eta: wp.vec3, k: wp.vec3, specular_reflectance: wp.vec3, wo: wp.vec3, u: wp.vec3
-) -> BsdfSample:
+def sample_conductor(eta: wp.vec3, k: wp.vec3, specular_reflectance: wp.vec3, wo: wp.vec3, u: wp.vec3) -> BsdfSample:
     """Mirror direction, weighted with the Fresnel reflectance; needs no random numbers."""
     result = no_sample()
     if wo[2] > 0.0:

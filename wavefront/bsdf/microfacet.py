@@ -82,9 +82,7 @@ def smith_g1(w: wp.vec3, alpha: float, distribution: int) -> float:
 def visible_normal_pdf(wo: wp.vec3, m: wp.vec3, alpha: float, distribution: int) -> float:
     """Density of the normals seen from wo: D(m) G1(wo) max(0, wo.m) / wo.z (Heitz and d'Eon 2014), wo.z > 0."""
     return (
-        microfacet_d(m, alpha, distribution)
-        * smith_g1_over_cos(wo, alpha, distribution)
-        * wp.max(0.0, wp.dot(wo, m))
+        microfacet_d(m, alpha, distribution) * smith_g1_over_cos(wo, alpha, distribution) * wp.max(0.0, wp.dot(wo, m))
     )
 
 
@@ -166,9 +164,7 @@ def _sample_visible_beckmann(wo: wp.vec3, alpha: float, u: wp.vec2) -> wp.vec3:
     length = wp.sqrt(alpha * alpha * sin_o * sin_o + wo[2] * wo[2])
     x = visible_beckmann_slope(wo[2] / length, alpha * sin_o / length, wp.min(u[0] + 0.5 * _STEP, 1.0 - _STEP))
     y = wp.erfinv(2.0 * u[1] - 1.0 + _STEP)
-    return wp.normalize(
-        wp.vec3(-alpha * (cos_phi * x - sin_phi * y), -alpha * (sin_phi * x + cos_phi * y), 1.0)
-    )
+    return wp.normalize(wp.vec3(-alpha * (cos_phi * x - sin_phi * y), -alpha * (sin_phi * x + cos_phi * y), 1.0))
 
 
 @wp.func

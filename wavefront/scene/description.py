@@ -55,12 +55,9 @@ class TransformStep(Record):
     matrix: tuple[Vec4, Vec4, Vec4, Vec4] | None = None
 
 
-# Four rows of four numbers (column vectors), or steps of which the first is applied first.
 Transform = Annotated[
     list[TransformStep | Vec4],
-    Meta(
-        description="Four rows of a 4x4 matrix that acts on column vectors, or a list of steps; the first step is applied first."
-    ),
+    Meta(description="Four rows of a 4x4 matrix that acts on column vectors, or steps; the first is applied first."),
 ]
 
 # --- textures --------------------------------------------------------------------------------------------------
@@ -79,9 +76,7 @@ class Bitmap(Record, tag_field="type", tag="bitmap"):
     name: str = ""
     color_space: Annotated[
         Literal["auto", "srgb", "linear"],
-        Meta(
-            description="How values are encoded; auto: 8-bit colours are sRGB, OpenEXR and scalar parameters are linear."
-        ),
+        Meta(description="How values are encoded; auto: 8-bit colours are sRGB, all else is linear."),
     ] = "auto"
     filter: Literal["bilinear", "nearest"] = "bilinear"
     wrap: Literal["repeat", "mirror", "clamp"] = "repeat"
