@@ -10,7 +10,7 @@ are fixed: a comparison that passes once passes always, until one of the rendere
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from scipy import stats
@@ -37,35 +37,76 @@ def tile_means(image: np.ndarray, tiles: tuple[int, int]) -> np.ndarray:
 
 
 @dataclasses.dataclass
-class Comparison:
-    """Batches of two renderers.
+class Estimate:
+    """What a renderer says of an image: means, the variances of these means, and how well the variances are known.
 
-    Args:
-        a: Tile means of the batches of the one, [batches, rows, columns, 3].
-        b: Those of the other; the number of batches may differ.
+    Attributes:
+        tiles: Means of tiles, [rows, columns, 3].
+        variance: Of `tiles`.
+        degrees: Degrees of freedom of the variances.
+        means: Of the whole image: R, G, B, and all three together, [4].
+        errors: Standard errors of `means`.
     """
 
-    a: np.ndarray
-    b: np.ndarray
+    tiles: np.ndarray
+    variance: np.ndarray
+    degrees: float
+    means: np.ndarray
+    errors: np.ndarray
 
-    @property
-    def degrees(self) -> np.ndarray:
-        """Welch and Satterthwaite's degrees of freedom of the difference, [rows, columns, 3]."""
-        va, vb = (x.var(axis=0, ddof=1) / len(x) for x in (self.a, self.b))
-        denominator = va**2 / (len(self.a) - 1) + vb**2 / (len(self.b) - 1)
-        return np.where(denominator > 0.0, (va + vb) ** 2 / np.maximum(denominator, 1e-300), 1.0)
+    @classmethod
+    def from_batches(cls, batches: Sequence[np.ndarray]) -> Estimate:
+        """From tile means of independent batches of equal size, [batches, rows, columns, 3]."""
+        batches = np.asarray(batches)
+        n = len(batches)
+        whole = batches.mean(axis=(1, 2))
+        whole = np.column_stack([whole, whole.mean(axis=1)])
+        return cls(
+            batches.mean(axis=0),
+            batches.var(axis=0, ddof=1) / n,
+            n - 1,
+            whole.mean(axis=0),
+            whole.std(axis=0, ddof=1) / np.sqrt(n),
+        )
+
+    @classmethod
+    def from_errors(cls, image: np.ndarray, error: np.ndarray, tiles: tuple[int, int]) -> Estimate:
+        """From an image and the standard error of every pixel, [H, W, 3] both, of many samples."""
+        pixels = image.shape[0] * image.shape[1]
+        means = image.mean(axis=(0, 1))
+        errors = np.sqrt((error**2).sum(axis=(0, 1))) / pixels
+        return cls(
+            tile_means(image, tiles),
+            tile_means(error**2, tiles) * (tiles[0] * tiles[1] / pixels),
+            np.inf,
+            np.append(means, means.mean()),
+            np.append(errors, errors.mean()),  # as if the channels erred together: an upper bound
+        )
+
+
+@dataclasses.dataclass
+class Comparison:
+    """Two estimates of one image, `a` over `b`."""
+
+    a: Estimate
+    b: Estimate
 
     @property
     def error(self) -> np.ndarray:
-        """Standard error of the difference of means, [rows, columns, 3]."""
-        return np.sqrt(self.a.var(axis=0, ddof=1) / len(self.a) + self.b.var(axis=0, ddof=1) / len(self.b))
+        """Standard error of the difference of tiles, [rows, columns, 3]."""
+        return np.sqrt(self.a.variance + self.b.variance)
+
+    @property
+    def degrees(self) -> np.ndarray:
+        """Welch and Satterthwaite's degrees of freedom of the difference of tiles, [rows, columns, 3]."""
+        denominator = self.a.variance**2 / self.a.degrees + self.b.variance**2 / self.b.degrees
+        return np.where(denominator > 0.0, self.error**4 / np.maximum(denominator, 1e-300), 1.0)
 
     @property
     def p_values(self) -> np.ndarray:
         """Two-sided, [rows, columns, 3]."""
-        mean_a, mean_b = self.a.mean(axis=0), self.b.mean(axis=0)
-        difference = np.maximum(np.abs(mean_a - mean_b) - ROUNDING * np.maximum(mean_a, mean_b), 0.0)
-        error = self.error
+        difference = np.abs(self.a.tiles - self.b.tiles) - ROUNDING * np.maximum(self.a.tiles, self.b.tiles)
+        difference, error = np.maximum(difference, 0.0), self.error
         t = np.divide(difference, error, out=np.where(difference > 0.0, np.inf, 0.0), where=error > 0.0)
         return 2.0 * stats.t.sf(t, self.degrees)
 
@@ -73,23 +114,20 @@ class Comparison:
         """Level of the test of one tile and channel."""
         return 1.0 - (1.0 - rate) ** (1.0 / self.error.size)
 
-    def ratio(self, channel: int | None = None) -> tuple[float, float]:
-        """Ratio of the image means a / b, of one channel or of all, and its standard error (first order)."""
-        pick = slice(None) if channel is None else slice(channel, channel + 1)
-        a, b = (x[..., pick].mean(axis=(1, 2, 3)) for x in (self.a, self.b))
-        ratio = a.mean() / b.mean()
-        error = ratio * np.hypot(_relative_error(a), _relative_error(b))
-        return float(ratio), float(error)
+    def ratio(self, channel: int = 3) -> tuple[float, float]:
+        """Ratio of the image means, of one channel or (3) of all, and its standard error (first order)."""
+        a, b = self.a.means[channel], self.b.means[channel]
+        return float(a / b), float(a / b * np.hypot(self.a.errors[channel] / a, self.b.errors[channel] / b))
 
     def interval(self, confidence: float = 0.95) -> tuple[float, float]:
         """Confidence interval of the ratio of the image means."""
         ratio, error = self.ratio()
-        half = error * stats.t.isf((1.0 - confidence) / 2.0, min(len(self.a), len(self.b)) - 1)
-        return ratio - half, ratio + half
+        half = error * stats.t.isf((1.0 - confidence) / 2.0, min(self.a.degrees, self.b.degrees))
+        return float(ratio - half), float(ratio + half)
 
     def detectable(self, power: float = 0.9) -> float:
         """The relative difference of one tile that is found with this power: the median over tiles with light."""
-        mean = self.b.mean(axis=0)
+        mean = self.b.tiles
         lit = mean > 1e-3 * mean.max()
         threshold = stats.t.isf(self.level() / 2.0, self.degrees) + stats.norm.isf(1.0 - power)
         return float(np.median((threshold * self.error)[lit] / mean[lit]))
@@ -101,8 +139,8 @@ class Comparison:
         return (
             f"ratio {ratio:.5f} ± {error:.5f}, 95 % interval [{low:.5f}, {high:.5f}]; smallest p {p.min():.1e} at tile "
             f"and channel {tuple(map(int, np.unravel_index(p.argmin(), p.shape)))}, level {self.level():.1e}; "
-            f"{len(self.a)} and {len(self.b)} batches; finds a difference of {100.0 * self.detectable():.2g} % in a "
-            f"tile and of {100.0 * 4.0 * error:.2g} % in the mean"
+            f"degrees of freedom {self.a.degrees} and {self.b.degrees}; finds a difference of "
+            f"{100.0 * self.detectable():.2g} % in a tile and of {100.0 * (RATIO_TOLERANCE - error):.2g} % in the mean"
         )
 
     def check(self, tolerance: float = RATIO_TOLERANCE) -> None:
@@ -112,41 +150,42 @@ class Comparison:
         assert 1.0 - tolerance <= low and high <= 1.0 + tolerance, f"the means differ: {self}"
 
 
-def _relative_error(batches):
-    return batches.std(ddof=1) / np.sqrt(len(batches)) / batches.mean()
+def collect(source: Iterator[np.ndarray], count: int, tiles: tuple[int, int]) -> np.ndarray:
+    """Tile means of the next batches, [count, rows, columns, 3]."""
+    return np.array([tile_means(np.asarray(next(source), np.float64), tiles) for _ in range(count)])
 
 
 def compare(
     a: Iterator[np.ndarray],
-    b: Iterator[np.ndarray],
+    b: Iterator[np.ndarray] | Estimate,
     tiles: tuple[int, int],
     error: float = 0.001,
-    batches: tuple[int, int] = (16, 256),
+    least: int = 16,
+    most: int = 256,
     progress: Callable[[Comparison], object] | None = None,
 ) -> Comparison:
-    """Takes batches of two renderers until their ratio of means is known.
+    """Takes batches of two renderers until the ratio of their means is known.
 
-    When to stop depends on the standard error alone, never on the difference, so it does not favour either outcome.
+    When to stop depends on the standard error alone, never on the difference, so it favours neither outcome.
 
     Args:
         a: Images [H, W, 3] of equal, independent batches of samples.
-        b: Those of the other renderer.
+        b: Those of the other renderer, or an estimate that is there already.
         tiles: Rows and columns of the grid.
         error: Standard error of the ratio to reach. 0.001 leaves 3 standard errors between a ratio of one and an
             interval that crosses `RATIO_TOLERANCE`.
-        batches: At least and at most so many of each.
-        progress: Called after each pair of batches from the first on that suffices for a comparison.
+        least: Batches of each at least.
+        most: Batches of each at most; it fails if `error` is not reached by then.
+        progress: Called with what is known, after every batch from the `least` on.
     """
-    taken: tuple[list, list] = ([], [])
+    ours, theirs = collect(a, least, tiles), None if isinstance(b, Estimate) else collect(b, least, tiles)
     while True:
-        for source, values in zip((a, b), taken, strict=True):
-            values.append(tile_means(np.asarray(next(source), np.float64), tiles))
-        count = len(taken[0])
-        if count < batches[0]:
-            continue
-        comparison = Comparison(*(np.array(values) for values in taken))
+        comparison = Comparison(Estimate.from_batches(ours), b if theirs is None else Estimate.from_batches(theirs))
         if progress is not None:
             progress(comparison)
         if comparison.ratio()[1] <= error:
             return comparison
-        assert count < batches[1], f"too noisy to say: {comparison}"
+        assert len(ours) < most, f"too noisy to say: {comparison}"
+        ours = np.concatenate([ours, collect(a, 1, tiles)])
+        if theirs is not None:
+            theirs = np.concatenate([theirs, collect(b, 1, tiles)])

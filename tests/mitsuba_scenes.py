@@ -8,6 +8,7 @@ rendering finds a difference of half a percent.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +17,12 @@ from PIL import Image
 SIZE = 32  # pixels of a side
 MAX_DEPTH = 5
 
-_SCENE = """<scene version="{version}">
-  <integrator type="path"><integer name="max_depth" value="{depth}"/><integer name="rr_depth" value="1000"/></integrator>
+_SCENE = """<scene version="3.0.0">
+  <integrator type="path">
+    <integer name="max_depth" value="{depth}"/><integer name="rr_depth" value="1000"/>
+  </integrator>
   <sensor type="perspective">
-    <float name="fov" value="34"/>{camera}
+    <float name="fov" value="27"/>{camera}
     <transform name="to_world"><lookat origin="0, 2.4, 6" target="0, 0.75, 0" up="0, 1, 0"/></transform>
     <film type="hdrfilm">
       <integer name="width" value="{width}"/><integer name="height" value="{height}"/><rfilter type="box"/>
@@ -40,6 +43,9 @@ LAMP = """<shape type="rectangle">
     </transform>
     <emitter type="area"><rgb name="radiance" value="12, 11, 10"/></emitter>
   </shape>"""
+
+# Beside the sky, so that it does not make all of the noise.
+WEAK_LAMP = LAMP.replace("12, 11, 10", "4, 3.6, 3.2")
 
 SKY = """<emitter type="constant"><rgb name="radiance" value="0.5, 0.6, 0.8"/></emitter>"""
 
@@ -84,20 +90,28 @@ EVERYTHING = "\n  ".join(
 )
 
 
-def document(body: list[str], everything: bool, version: str = "3.0.0", camera: str = "", size=(SIZE, SIZE)) -> str:
+def document(body: list[str], everything: bool, camera: str = "", size=(SIZE, SIZE)) -> str:
     """The XML text of a scene.
 
     Args:
         body: Its shapes and emitters.
         everything: Whether to add `EVERYTHING`, which also needs a constant emitter and the file ``texture.png``.
-        version: Dialect.
         camera: Further elements of the sensor.
         size: Width and height, pixels.
     """
     parts = [*body, EVERYTHING] if everything else body
-    return _SCENE.format(
-        version=version, depth=MAX_DEPTH, camera=camera, width=size[0], height=size[1], body="\n  ".join(parts)
-    )
+    return _SCENE.format(depth=MAX_DEPTH, camera=camera, width=size[0], height=size[1], body="\n  ".join(parts))
+
+
+def in_dialect_0_6(text: str) -> str:
+    """A scene as Mitsuba 0.6 spells it: names in camel case."""
+    names = {"int_ior": "intIOR", "ext_ior": "extIOR"}
+
+    def spell(match):
+        name = match[1]
+        return f'name="{names.get(name) or re.sub("_(.)", lambda m: m[1].upper(), name)}"'
+
+    return re.sub('name="([a-z_]+)"', spell, text).replace('version="3.0.0"', 'version="0.6.0"')
 
 
 def _texture(parameter: str, wrap: str = "repeat", scale: float = 2.6, raw: bool = False) -> str:
@@ -144,8 +158,8 @@ PLAIN: dict[str, list[str]] = {
     ],
     "mesh light": [
         FLOOR,
-        # Flat: where normals are interpolated, Mitsuba converts areas to solid angles by the shading normal, which is not
-        # the measure that it samples, and its image depends on the share of light samples.
+        # Flat: where normals are interpolated, Mitsuba converts areas to solid angles by the shading normal; its
+        # light samples and its BSDF samples then do not agree on the image.
         """<shape type="obj"><string name="filename" value="ball.obj"/><boolean name="face_normals" value="true"/>
     <transform name="to_world"><scale value="0.7"/><translate x="-0.4" y="1.8" z="0.3"/></transform>
     <emitter type="area"><rgb name="radiance" value="3, 4, 5"/></emitter></shape>""",
@@ -162,15 +176,15 @@ PLAIN: dict[str, list[str]] = {
 
 # The kernels of a scene with all kinds of everything.
 MIXED: dict[str, list[str]] = {
-    "conductor": [FLOOR, LAMP, SKY, ball('<bsdf type="conductor"><string name="material" value="Au"/></bsdf>')],
-    "rough conductor, GGX": [FLOOR, LAMP, SKY, ball(_rough("roughconductor", "ggx", 0.4, METAL))],
-    "rough conductor, Beckmann": [FLOOR, LAMP, SKY, ball(_rough("roughconductor", "beckmann", 0.3, METAL))],
+    "conductor": [FLOOR, WEAK_LAMP, SKY, ball('<bsdf type="conductor"><string name="material" value="Au"/></bsdf>')],
+    "rough conductor, GGX": [FLOOR, WEAK_LAMP, SKY, ball(_rough("roughconductor", "ggx", 0.4, METAL))],
+    "rough conductor, Beckmann": [FLOOR, WEAK_LAMP, SKY, ball(_rough("roughconductor", "beckmann", 0.3, METAL))],
     "dielectric": [FLOOR, SKY, ball(f'<bsdf type="dielectric">{_GLASS}</bsdf>')],
     "rough dielectric, GGX": [FLOOR, SKY, ball(_rough("roughdielectric", "ggx", 0.3, _GLASS))],
     "rough dielectric, Beckmann": [FLOOR, SKY, ball(_rough("roughdielectric", "beckmann", 0.3, _GLASS))],
     "opacity": [
         FLOOR,
-        LAMP,
+        WEAK_LAMP,
         SKY,
         panel(
             f'<bsdf type="mask"><float name="opacity" value="0.3"/><bsdf type="twosided">'
@@ -179,15 +193,20 @@ MIXED: dict[str, list[str]] = {
     ],
     "opacity bitmap": [
         FLOOR,
-        LAMP,
+        WEAK_LAMP,
         SKY,
         panel(f'<bsdf type="mask">{_texture("opacity", raw=True)}{_PAINT.format("0.8, 0.3, 0.2")}</bsdf>'),
     ],
-    "bitmap, repeat": [FLOOR, LAMP, SKY, panel(f'<bsdf type="diffuse">{_texture("reflectance")}</bsdf>')],
-    "bitmap, mirror": [FLOOR, LAMP, SKY, panel(f'<bsdf type="diffuse">{_texture("reflectance", "mirror")}</bsdf>')],
-    "bitmap, clamp": [FLOOR, LAMP, SKY, panel(f'<bsdf type="diffuse">{_texture("reflectance", "clamp")}</bsdf>')],
-    "bitmap on a ball": [FLOOR, LAMP, SKY, ball(f'<bsdf type="diffuse">{_texture("reflectance")}</bsdf>')],
-    "checkerboard": [FLOOR, LAMP, SKY, panel(f'<bsdf type="diffuse">{_CHECKS}</bsdf>')],
+    "bitmap, repeat": [FLOOR, WEAK_LAMP, SKY, panel(f'<bsdf type="diffuse">{_texture("reflectance")}</bsdf>')],
+    "bitmap, mirror": [
+        FLOOR,
+        WEAK_LAMP,
+        SKY,
+        panel(f'<bsdf type="diffuse">{_texture("reflectance", "mirror")}</bsdf>'),
+    ],
+    "bitmap, clamp": [FLOOR, WEAK_LAMP, SKY, panel(f'<bsdf type="diffuse">{_texture("reflectance", "clamp")}</bsdf>')],
+    "bitmap on a ball": [FLOOR, WEAK_LAMP, SKY, ball(f'<bsdf type="diffuse">{_texture("reflectance")}</bsdf>')],
+    "checkerboard": [FLOOR, WEAK_LAMP, SKY, panel(f'<bsdf type="diffuse">{_CHECKS}</bsdf>')],
     "sky": [FLOOR, SKY, ball(_PAINT.format("0.7, 0.7, 0.2"))],
     "sphere light": [
         FLOOR,
@@ -200,7 +219,9 @@ MIXED: dict[str, list[str]] = {
 # Elements of the sensor, and the size of the film.
 CAMERAS: dict[str, tuple[str, tuple[int, int]]] = {
     axis: (f'<string name="fov_axis" value="{axis}"/>', size)
-    for axis, size in (("x", (48, 24)), ("y", (48, 24)), ("diagonal", (48, 24)), ("smaller", (24, 48)), ("larger", (24, 48)))
+    for axis, size in zip(
+        ("x", "y", "diagonal", "smaller", "larger"), ((48, 24), (48, 24), (48, 24), (24, 32), (24, 32)), strict=True
+    )
 }
 
 

@@ -26,7 +26,7 @@ def check(scene, spp=SPP, seed=3):
     expected = render_megakernel(renderer, spp)
     assert sum(renderer.statistics.nonfinite.values()) == 0
     assert np.isfinite(expected).all()
-    assert expected.max() > 0.0
+    assert expected.max() > 0.0 or not scene.integrator.nee  # without it, few paths may find a small light: none
     error = np.abs(image - expected).max(axis=2)
     # Relative to the pixel, or to the mean of the image for pixels that are nearly black.
     scale = np.maximum(expected.max(axis=2), 1e-3 * expected.mean())

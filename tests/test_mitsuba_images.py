@@ -4,20 +4,25 @@ Every comparison has two parts (see `tests.image_test`): no tile differs, at a f
 image, and the 95 % confidence interval of the ratio of image means lies within 1 ± 0.005. Samples are taken until the
 ratio is known to 0.1 %, so a difference of 0.4 % in the mean, or of a few percent in one tile, fails.
 
-The variant of Mitsuba is `llvm_ad_rgb` where LLVM is installed, because it is faster, else `scalar_rgb`; the environment
-variable WAVEFRONT_PEER_VARIANT chooses another one.
+The variant of Mitsuba is `llvm_ad_rgb` where LLVM is installed, because it is faster, else `scalar_rgb`; the
+environment variable WAVEFRONT_PEER_VARIANT chooses another one.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import os
+import zlib
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
+from scipy import stats
 
 from tests import mitsuba_scenes as scenes
-from tests.image_test import Comparison, compare
+from tests.image_test import Comparison, Estimate, collect, compare
 from wavefront.renderer import Renderer
 from wavefront.scene import description, load_scene
 
@@ -27,7 +32,6 @@ from tools.peers import mitsuba as peer  # noqa: E402
 OWN_SCENES = sorted((Path(__file__).parent.parent / "scenes").glob("*.json"))
 REAL_SCENES = os.environ.get("WAVEFRONT_SCENES")
 needs_real_scenes = pytest.mark.skipif(not REAL_SCENES, reason="WAVEFRONT_SCENES names no folder of real scenes")
-SPP = 32  # of a batch; 32 x 32 pixels then take some hundredths of a second
 TILES = (4, 4)
 
 
@@ -51,9 +55,10 @@ def folder(tmp_path_factory):
     return path
 
 
-def our_batches(scene: description.Scene, spp: int, seed: int = 1):
+def our_batches(scene: description.Scene, spp: int):
     """Means of consecutive samples of one render, which are independent."""
-    renderer = Renderer(scene, seed=seed)
+    # Another seed for every scene, so that the errors of different tests are independent.
+    renderer = Renderer(scene, seed=zlib.crc32(repr(scene).encode()))
     before = np.zeros(1)
     while True:
         renderer.render(spp=spp)
@@ -70,30 +75,20 @@ def their_batches(scene, max_depth: int, spp: int):
         seed += 1
 
 
-def read(path: Path, width: int, height: int, max_depth: int, nee: bool = True) -> description.Scene:
-    """Our scene with a film and an integrator as those of the peer."""
-    scene = load_scene(path)
+def like_the_peer(scene: description.Scene, width: int, height: int, max_depth: int, nee: bool = True):
+    """The scene with a film and an integrator as the peer has them."""
     scene.film = description.Film(width=width, height=height)
     scene.integrator = description.PathIntegrator(max_depth=max_depth, rr_depth=None, nee=nee)
     return scene
 
 
-def compare_xml(
-    path: Path,
-    size: tuple[int, int],
-    max_depth: int = scenes.MAX_DEPTH,
-    spp: int = SPP,
-    tiles: tuple[int, int] = TILES,
-    nee: bool = True,
-    **settings,
-) -> Comparison:
+def compare_xml(path: Path, size: tuple[int, int], max_depth: int, spp: int, tiles, nee=True, **settings) -> Comparison:
     """Renders a Mitsuba file with both; `settings` are those of `image_test.compare`."""
-    ours = our_batches(read(path, *size, max_depth, nee), spp)
-    theirs = their_batches(peer.load_xml(path, *size), max_depth, spp)
-    return compare(ours, theirs, tiles, **settings)
+    ours = our_batches(like_the_peer(load_scene(path), *size, max_depth, nee), spp)
+    return compare(ours, their_batches(peer.load_xml(path, *size), max_depth, spp), tiles, **settings)
 
 
-def report(name: str, comparison: Comparison) -> None:
+def check(name: str, comparison: Comparison) -> None:
     print(f"{name}: {comparison}")  # shown with -s, or when the test fails
     comparison.check()
 
@@ -101,11 +96,11 @@ def report(name: str, comparison: Comparison) -> None:
 # --- small scenes ------------------------------------------------------------------------------------------------
 
 
-def check_small(folder: Path, name: str, text: str, size=(scenes.SIZE, scenes.SIZE), **settings) -> None:
+def check_small(folder: Path, name: str, text: str, size=(scenes.SIZE, scenes.SIZE), nee: bool = True) -> None:
     path = folder / "scene.xml"
     path.write_text(text, encoding="utf-8")
-    comparison = compare_xml(path, size, **settings)
-    report(name, comparison)
+    comparison = compare_xml(path, size, scenes.MAX_DEPTH, 32, TILES, nee)
+    check(name, comparison)
     assert comparison.detectable() < 0.1, "the tiles are too noisy to find anything"
 
 
@@ -124,3 +119,88 @@ def test_camera(folder, axis):
     camera, size = scenes.CAMERAS[axis]
     text = scenes.document(scenes.PLAIN["diffuse"], everything=False, camera=camera, size=size)
     check_small(folder, axis, text, size)
+
+
+def test_without_light_sampling(folder):
+    """The mean is the same; Mitsuba always samples lights."""
+    check_small(folder, "no light sampling", scenes.document(scenes.MIXED["sky"], everything=True), nee=False)
+
+
+def test_older_dialect(folder):
+    """Mitsuba upgrades the file in its own way."""
+    text = scenes.document(scenes.MIXED["rough dielectric, GGX"], everything=True)
+    check_small(folder, "dialect 0.6", scenes.in_dialect_0_6(text))
+
+
+# --- our own scenes, through our records -------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", OWN_SCENES, ids=lambda path: path.stem)
+def test_own_scene(path):
+    scene = load_scene(path)
+    film = scene.film
+    like_the_peer(scene, film.width, film.height, scene.integrator.max_depth)
+    theirs = their_batches(peer.load_records(scene), scene.integrator.max_depth, 4)
+    check(path.stem, compare(our_batches(scene, 4), theirs, (8, 8), most=1024))
+
+
+# --- real scenes -------------------------------------------------------------------------------------------------
+
+# File, size, depth, samples per batch. Films are large and batches of few samples: a pixel is a stratum, and the edges
+# of small bright lights make most of the noise.
+REAL = {
+    "cornell-box": ("cornell-box/scene.xml", (256, 256), 8, 8),
+    "cornell-box, original": ("cornell-box/original.xml", (256, 256), 8, 8),
+    "veach-mis": ("veach-mis/scene.xml", (1280, 720), 3, 2),
+    "veach-ajar": ("veach-ajar/scene.xml", (320, 180), 10, 8),
+}
+
+
+@needs_real_scenes
+@pytest.mark.slow
+@pytest.mark.parametrize("name", REAL)
+def test_real_scene(name):
+    file, size, max_depth, spp = REAL[name]
+    tiles = (9, 16) if size[0] * 9 == size[1] * 16 else (8, 8)
+    check(name, compare_xml(Path(REAL_SCENES) / file, size, max_depth, spp, tiles, most=1024))
+
+
+@needs_real_scenes
+@pytest.mark.slow
+def test_reference_of_veach_ajar():
+    """Against an image of 14336 samples per pixel that Mitsuba made once."""
+    file = Path(REAL_SCENES).parent / "references" / "veach-ajar.exr"
+    if not file.exists():
+        pytest.skip(f"there is no reference {file}")
+    channels = OpenEXR.File(str(file), separate_channels=True).channels()
+    image, error = (
+        np.stack([channels[prefix + c].pixels for c in "RGB"], axis=-1).astype(np.float64) for prefix in ("", "se.")
+    )
+    account = json.loads(file.with_suffix(".json").read_text(encoding="utf-8"))
+    scene = load_scene(Path(REAL_SCENES) / "veach-ajar" / "scene.xml")
+    ours = our_batches(like_the_peer(scene, account["width"], account["height"], account["max_depth"]), 8)
+    tiles = (9, 16)
+    check("veach-ajar, reference", compare(ours, Estimate.from_errors(image, error, tiles), tiles, most=1024))
+
+
+# --- the test itself ---------------------------------------------------------------------------------------------
+
+
+def test_tiles_are_calibrated(folder):
+    """Ours against ours: the p-values of tiles are uniform, and a difference of 3 % in the image is found."""
+    path = folder / "scene.xml"
+    path.write_text(scenes.document(scenes.PLAIN["diffuse"], everything=False), encoding="utf-8")
+    scene = like_the_peer(load_scene(path), scenes.SIZE, scenes.SIZE, scenes.MAX_DEPTH)
+    p_values, batches = [], our_batches(scene, 16)
+    for _ in range(8):
+        a, b = (Estimate.from_batches(collect(batches, 16, TILES)) for _ in range(2))
+        p_values.append(Comparison(a, b).p_values[..., 1].ravel())  # channels err together: one of them
+    # Its own false alarm rate is 1e-3.
+    assert stats.kstest(np.concatenate(p_values), "uniform").pvalue > 1e-3
+    brighter = dataclasses.replace(a, tiles=1.03 * a.tiles, means=1.03 * a.means)
+    with pytest.raises(AssertionError, match="tiles differ"):
+        Comparison(brighter, b).check()
+    slightly = dataclasses.replace(a, means=1.006 * a.means)
+    with pytest.raises(AssertionError, match="means differ"):
+        Comparison(slightly, b).check()

@@ -94,7 +94,8 @@ class Soup:
             wp.zeros(n, dtype=Hit, device=DEVICE),
             wp.zeros(n, dtype=wp.vec3, device=DEVICE),
         ]
-        inputs = [self.geometry, wp.array(hits, dtype=Hit, device=DEVICE), wp.array(direction, dtype=wp.vec3, device=DEVICE)]
+        hits, direction = wp.array(hits, dtype=Hit, device=DEVICE), wp.array(direction, dtype=wp.vec3, device=DEVICE)
+        inputs = [self.geometry, hits, direction]
         wp.launch(triangle_kernel, dim=n, inputs=inputs, outputs=out, device=DEVICE)
         return [a.numpy() for a in out]
 
@@ -183,7 +184,8 @@ class OneSphere:
             wp.zeros(n, dtype=Vertex, device=DEVICE),
             wp.zeros(n, dtype=Hit, device=DEVICE),
         ]
-        rays = [wp.array(np.ascontiguousarray(a, np.float32), dtype=wp.vec3, device=DEVICE) for a in (origin, direction, leaving)]
+        rays = [np.ascontiguousarray(a, np.float32) for a in (origin, direction, leaving)]
+        rays = [wp.array(a, dtype=wp.vec3, device=DEVICE) for a in rays]
         wp.launch(sphere_kernel, dim=n, inputs=[self.geometry, *rays], outputs=out, device=DEVICE)
         return [a.numpy() for a in out]
 

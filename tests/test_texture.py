@@ -114,7 +114,8 @@ def oracle(name, uv, srgb, nearest, mode):
 def coordinates(seed, count=4000):
     """Random inside the unit square and far outside, and every pair of special values."""
     rng = np.random.default_rng(seed)
-    special = np.float32([0.0, 1.0, -1.0, 0.5, 2.0, -0.25, -1e-9, 1e-9, 1.0 - 2.0**-24, 1e6, -1e6, 1e6 + 0.25, 3e9, -7e20])
+    special = [0.0, 1.0, -1.0, 0.5, 2.0, -0.25, -1e-9, 1e-9, 1.0 - 2.0**-24, 1e6, -1e6, 1e6 + 0.25, 3e9, -7e20]
+    special = np.float32(special)
     pairs = np.stack(np.meshgrid(special, special), axis=-1).reshape(-1, 2)
     inside, outside = rng.random((count, 2)), rng.uniform(-50.0, 50.0, (count, 2))
     return np.concatenate([inside, outside, pairs]).astype(np.float32)

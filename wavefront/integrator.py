@@ -171,22 +171,21 @@ class Worker:
         scale = FILTER_SCALES[features.filter](scene.film.filter)
         max_depth, rr_depth = scene.integrator.max_depth, scene.integrator.rr_depth or 0
         width, sums, seed = film.width, film.arrays, wp.uint64(seed)
+        tables = geometry, materials, textures, lights
         # In the order of the kernels' parameters.
-        # fmt: off
         arguments = {
             "generate": [camera, tile, width, scale, seed, paths, rays, counters, totals],
             "intersect": [geometry, paths, rays, max_depth, surfaces, hits, escaped, emissive, counters],
             "escaped": [lights, paths, escaped, counters],
             "emission": [geometry, lights, textures, paths, surfaces, emissive, counters],
             "aov": [materials, textures, paths, surfaces, tile, width, sums],
-            "direct": [geometry, materials, textures, lights, paths, surfaces, hits, seed, shadow_rays, shadow, counters],
+            "direct": [*tables, paths, surfaces, hits, seed, shadow_rays, shadow, counters],
             "shadow": [geometry, shadow_rays, shadow, paths],
             "drain": [counters, totals],
             "scatter": [materials, textures, surfaces, hits, rr_depth, seed, paths, rays, counters],
             "advance": [counters],
             "accumulate": [paths, tile, width, sums],
         }
-        # fmt: on
         self.commands = {
             stage: wp.launch(kernel, dim=capacity, inputs=arguments[stage], device=device, record_cmd=True)
             for stage in arguments

@@ -1,7 +1,7 @@
 """Mitsuba 3 as a peer: loads its own XML or our records, and renders with its `path` integrator.
 
-Mitsuba is imported when a function needs it. Its *variant* (scalar, LLVM, CUDA) is a state of the process: choose it with
-`use_variant` before anything is loaded, and load scenes again after changing it.
+Mitsuba is imported when a function needs it. Its *variant* (scalar, LLVM, CUDA) is a state of the process: choose it
+with `use_variant` before anything is loaded, and load scenes again after changing it.
 """
 
 from __future__ import annotations
@@ -12,13 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from tools.peers.mitsuba_records import from_records
+from tools.peers.mitsuba_records import NEVER, from_records
 from wavefront.errors import WavefrontError
 from wavefront.scene import description
 
 __all__ = ["from_records", "load_records", "load_xml", "missing", "render", "require", "use_variant"]
 
-NEVER = 1 << 30  # depth from which Russian roulette may end a path, where it may not
 PATHS_PER_PASS = 1 << 24  # the arrays of a wavefront stay within some GB
 
 
@@ -146,13 +145,13 @@ def _replace_film(mi, parser, state, path, width, height):
         if kind == mi.ObjectType.Integrator:
             integrator = state.nodes[i].props
             for key in list(integrator.keys()):
-                integrator.remove_property(key)
+                del integrator[key]
             integrator.set_plugin_name("path")
     sensor = state.nodes[kinds.index(mi.ObjectType.Sensor)].props
     for key in list(sensor.keys()):
         child = sensor[key]
         if isinstance(child, mi.Properties.ResolvedReference) and kinds[child.index()] == mi.ObjectType.Film:
-            sensor.remove_property(key)
+            del sensor[key]
     sensor["film"] = mi.Properties.ResolvedReference(film)
 
 
@@ -216,7 +215,8 @@ def render(
         raise WavefrontError(f"max_depth {max_depth}, rr_depth {rr_depth}; allowed: 1 or more")
     if threads is not None:
         set_threads(threads)
-    integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": NEVER if rr_depth is None else rr_depth})
+    rr_depth = NEVER if rr_depth is None else rr_depth
+    integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": rr_depth})
     camera = scene.sensors()[sensor]
     pixels = int(np.prod(np.array(camera.film().crop_size())))
     largest = max(1, PATHS_PER_PASS // pixels)

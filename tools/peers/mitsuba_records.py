@@ -14,7 +14,7 @@ from wavefront.scene.transforms import is_mirror, to_matrix
 
 # Mitsuba's camera looks along +Z with +X to the left; ours along -Z with +X to the right.
 CAMERA_FRAME = np.diag([-1.0, 1.0, -1.0, 1.0])
-NEVER = 1 << 30  # Russian roulette that never comes
+NEVER = 1 << 30  # rr_depth where there is no Russian roulette
 
 
 def from_records(scene: description.Scene, folder: str | Path) -> dict:
@@ -34,7 +34,7 @@ def from_records(scene: description.Scene, folder: str | Path) -> dict:
 
 class _Writer:
     def __init__(self, scene: description.Scene, folder: Path):
-        import mitsuba
+        import mitsuba  # only here: a peer that need not be installed
 
         self.mi, self.scene, self.folder = mitsuba, scene, folder
 
@@ -75,7 +75,7 @@ class _Writer:
                 "component_format": "float32",
                 "rfilter": rfilter,
             },
-            "sampler": {"type": "independent", "sample_count": integrator_spp(self.scene)},
+            "sampler": {"type": "independent", "sample_count": self.scene.integrator.spp},
         }
 
     def _transform(self, matrix):
@@ -162,10 +162,6 @@ class _Writer:
     def _uv_transform(self, texture):
         (a, b, c), (d, e, f) = texture.uv_transform
         return self._transform([[a, b, 0.0, c], [d, e, 0.0, f], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-
-
-def integrator_spp(scene: description.Scene) -> int:
-    return scene.integrator.spp
 
 
 def _colour(value):
