@@ -13,7 +13,7 @@ import functools
 import numpy as np
 import warp as wp
 
-from wavefront.accel.mesh_query import Geometry, make_intersector
+from wavefront.accel.mesh_query import INFINITE, Geometry, make_intersector
 from wavefront.bsdf.dispatch import is_smooth, make_bsdf
 from wavefront.bsdf.tables import KINDS as BSDF_KINDS
 from wavefront.bsdf.tables import MaterialTables
@@ -105,9 +105,7 @@ def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
                 emitter = lights.emitters[lights.lights[index].emitter]
                 w = float(1.0)
                 if settings.nee == 1 and bsdf_pdf > 0.0:
-                    b = light_pdf(
-                        lights, geometry, index, origin, direction, vertex.position, vertex.geometric_normal
-                    )
+                    b = light_pdf(lights, geometry, index, origin, direction, vertex.position, vertex.geometric_normal)
                     ratio = b / bsdf_pdf
                     w = 1.0 / (1.0 + ratio * ratio)
                 Le = eval_parameter(textures, emitter.radiance, emitter.radiance_texture, vertex.uv)
@@ -120,13 +118,13 @@ def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
             facing = is_smooth(materials.materials[shape.material], wp.dot(normal, wo))
             if settings.nee == 1 and facing and lights.lights.shape[0] > 0:
                 u = uniform4(seed, key, sample, segment - 1, PURPOSE_LIGHT)
-                light = sample_light(lights, geometry, textures, vertex.position, wp.vec3(u[0], u[1], u[2]))
+                light = sample_light(lights, geometry, textures, vertex.position, u)
                 if wp.max(light.L) > 0.0:
                     f = eval_bsdf(materials, textures, shape.material, vertex.uv, normal, wo, light.wi)
                     if wp.max(f.value) > 0.0:
                         start = spawn_origin(vertex.position, vertex.geometric_normal, vertex.offset, light.wi)
                         to_light = light.wi
-                        if light.t_max == 1.0:
+                        if light.t_max < INFINITE:
                             to_light = light.target - start
                         if not occluded(geometry, start, to_light, light.t_max):
                             ratio = f.pdf / light.pdf
@@ -134,9 +132,7 @@ def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
                             L += (w / light.pdf) * wp.cw_mul(beta, wp.cw_mul(f.value, light.L))
 
             u = uniform4(seed, key, sample, segment - 1, PURPOSE_BSDF)
-            s = sample_bsdf(
-                materials, textures, shape.material, vertex.uv, normal, wo, wp.vec3(u[0], u[1], u[2])
-            )
+            s = sample_bsdf(materials, textures, shape.material, vertex.uv, normal, wo, wp.vec3(u[0], u[1], u[2]))
             beta = wp.cw_mul(beta, s.weight)
             if not wp.max(beta) > 0.0:
                 break

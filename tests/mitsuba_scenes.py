@@ -161,8 +161,8 @@ PLAIN: dict[str, list[str]] = {
         # Flat: where normals are interpolated, Mitsuba converts areas to solid angles by the shading normal; its
         # light samples and its BSDF samples then do not agree on the image.
         """<shape type="obj"><string name="filename" value="ball.obj"/><boolean name="face_normals" value="true"/>
-    <transform name="to_world"><scale value="0.7"/><translate x="-0.4" y="1.8" z="0.3"/></transform>
-    <emitter type="area"><rgb name="radiance" value="3, 4, 5"/></emitter></shape>""",
+    <transform name="to_world"><scale value="0.5"/><translate x="-0.4" y="2" z="0.3"/></transform>
+    <emitter type="area"><rgb name="radiance" value="6, 8, 10"/></emitter></shape>""",
     ],
     "cube and disk": [
         FLOOR,

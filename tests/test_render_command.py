@@ -86,7 +86,7 @@ def test_writes_image_picture_and_account(scene, tmp_path, capsys):
     assert account["settings"]["seed"] == 3
     assert account["settings"]["integrator"]["max_depth"] == 4
     assert account["seconds"]["compile"] >= 0 and account["seconds"]["render"] > 0
-    assert account["nonfinite"] == {"emission": 0, "escaped": 0, "direct": 0, "scatter": 0}
+    assert account["nonfinite"] == {"emission": 0, "escaped": 0, "direct": 0, "scatter": 0, "accumulate": 0}
     assert account["peak_memory_bytes"] > 1 << 20
     assert len(account["scene_sha256"]) == 64
 

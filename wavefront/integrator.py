@@ -184,7 +184,7 @@ class Worker:
             "drain": [counters, totals],
             "scatter": [materials, textures, surfaces, hits, rr_depth, seed, paths, rays, counters],
             "advance": [counters],
-            "accumulate": [paths, tile, width, sums],
+            "accumulate": [paths, tile, width, sums, counters],
         }
         self.commands = {
             stage: wp.launch(kernel, dim=capacity, inputs=arguments[stage], device=device, record_cmd=True)

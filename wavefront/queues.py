@@ -23,8 +23,9 @@ NONFINITE_EMISSION = wp.constant(8)  # contributions left out because they were 
 NONFINITE_ESCAPED = wp.constant(9)
 NONFINITE_DIRECT = wp.constant(10)
 NONFINITE_SCATTER = wp.constant(11)
-COUNTER_COUNT = 12
-NONFINITE_STAGES = {"emission": 8, "escaped": 9, "direct": 10, "scatter": 11}
+NONFINITE_ACCUMULATE = wp.constant(12)
+COUNTER_COUNT = 13
+NONFINITE_STAGES = {"emission": 8, "escaped": 9, "direct": 10, "scatter": 11, "accumulate": 12}
 
 STATUS_QUEUE_OVERFLOW = wp.constant(1)
 

@@ -34,8 +34,20 @@ def position_error(v0: wp.vec3, v1: wp.vec3, v2: wp.vec3, b0: float, b1: float, 
     """
     b2 = wp.abs(1.0 - b0 - b1)
     magnitude = b0 * wp.abs(v0) + b1 * wp.abs(v1) + b2 * wp.abs(v2)
-    extent = wp.max(wp.max(wp.abs(v1 - v0)), wp.max(wp.abs(v2 - v0)))
-    return POSITION_ERROR * (wp.dot(magnitude, wp.abs(normal)) + extent)
+    return POSITION_ERROR * (wp.dot(magnitude, wp.abs(normal)) + triangle_extent(v0, v1, v2))
+
+
+@wp.func
+def triangle_extent(v0: wp.vec3, v1: wp.vec3, v2: wp.vec3) -> float:
+    """Largest coordinate of the edges from v0."""
+    return wp.max(wp.max(wp.abs(v1 - v0)), wp.max(wp.abs(v2 - v0)))
+
+
+@wp.func
+def scaled_cross(v0: wp.vec3, v1: wp.vec3, v2: wp.vec3, extent: float) -> wp.vec3:
+    """Cross product of the edges from v0, divided by extent^2 so that its square fits a float32 at any scale."""
+    scale = 1.0 / extent
+    return wp.cross((v1 - v0) * scale, (v2 - v0) * scale)
 
 
 @wp.func
@@ -75,7 +87,7 @@ def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
                 v2 = geometry.points[i2]
                 b2 = 1.0 - hit.u - hit.v
                 vertex.position = hit.u * v0 + hit.v * v1 + b2 * v2
-                normal = wp.normalize(wp.cross(v1 - v0, v2 - v0))
+                normal = wp.normalize(scaled_cross(v0, v1, v2, triangle_extent(v0, v1, v2)))
                 vertex.shading_normal = normal
                 if wp.static(smooth):
                     if geometry.shapes[geometry.shape_of[hit.primitive]].smooth == 1:

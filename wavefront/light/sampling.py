@@ -8,7 +8,7 @@ import warp as wp
 
 from wavefront.accel.mesh_query import INFINITE, Geometry
 from wavefront.light.tables import KIND_CONSTANT, KIND_SPHERE, KIND_TRIANGLE, LightTables
-from wavefront.surface import position_error, sphere_uv
+from wavefront.surface import position_error, scaled_cross, sphere_uv, triangle_extent
 from wavefront.texture import TextureTables, make_eval_parameter
 from wavefront.warp_samples import (
     cone_pdf,
@@ -20,24 +20,34 @@ from wavefront.warp_samples import (
     to_world,
 )
 
+# A shadow ray ends before its light by the roundings of a distance: a ray test cannot place a small, far light better.
+SHADOW_T_MAX = wp.constant(1.0 - 32.0 * 5.9604645e-8)
+
 
 @wp.struct
 class LightSample:
     wi: wp.vec3  # unit vector towards the light
     target: wp.vec3  # where the shadow ray ends; unused for the environment
-    t_max: wp.float32  # of a shadow ray to the target: 1, or INFINITE for the environment
+    t_max: wp.float32  # of a shadow ray to the target, in units of its distance; INFINITE for the environment
     L: wp.vec3  # emitted radiance; zero if the sample is useless
     pdf: wp.float32  # in solid angle, selection included
 
 
 @wp.func
-def select_light(lights: LightTables, u: float) -> int:
-    """Index of a light drawn from the alias table."""
+def select_light(lights: LightTables, u: wp.vec2) -> int:
+    """Index of a light drawn from the alias table by two uniform numbers.
+
+    A number has 24 bits, too few to choose evenly among 10^5 cells and then between the two lights of a cell. Both
+    together are one number of 40 bits in fixed point; times n, its integer part is the cell and its fraction chooses.
+    """
     n = lights.lights.shape[0]
-    scaled = u * float(n)
-    cell = wp.min(int(scaled), n - 1)
+    high = wp.uint64(u[0] * 16777216.0)
+    low = wp.uint64(u[1] * 65536.0)
+    scaled = (high * wp.uint64(65536) + low) * wp.uint64(n)
+    cell = int(scaled >> wp.uint64(40))
+    fraction = float(scaled & wp.uint64(0xFFFFFFFFFF)) * 9.094947017729282e-13  # 2^-40
     light = lights.lights[cell]
-    return wp.where(scaled - float(cell) < light.alias_threshold, cell, light.alias)
+    return wp.where(fraction < light.alias_threshold, cell, light.alias)
 
 
 @wp.func
@@ -61,7 +71,8 @@ def make_light_sampler(kinds: tuple[str, ...], textures: tuple[str, ...]):
         textures: Kinds of texture that emitters may have.
 
     Returns:
-        `sample_light(lights, geometry, textures, p, u) -> LightSample` for a point p, and
+        `sample_light(lights, geometry, textures, p, u) -> LightSample` for a point p, where u.x and u.w choose the
+        light, and
         `light_pdf(lights, geometry, light, p, wi, q, normal) -> float`, the density in solid angle with which that
         would have chosen the point q (with its normal) of a light, seen from p in direction wi.
     """
@@ -73,11 +84,11 @@ def make_light_sampler(kinds: tuple[str, ...], textures: tuple[str, ...]):
 
     @wp.func
     def sample_light(
-        lights: LightTables, geometry: Geometry, textures: TextureTables, p: wp.vec3, u: wp.vec3
+        lights: LightTables, geometry: Geometry, textures: TextureTables, p: wp.vec3, u: wp.vec4
     ) -> LightSample:
         result = LightSample()
-        result.t_max = 1.0
-        light = lights.lights[select_light(lights, u[0])]
+        result.t_max = SHADOW_T_MAX
+        light = lights.lights[select_light(lights, wp.vec2(u[0], u[3]))]
         emitter = lights.emitters[light.emitter]
         if wp.static(has_triangle):
             if light.kind == KIND_TRIANGLE:
@@ -92,9 +103,9 @@ def make_light_sampler(kinds: tuple[str, ...], textures: tuple[str, ...]):
                 b2 = b12[1]
                 q = b[0] * v0 + b[1] * v1 + b2 * v2
                 to_light = q - p
-                distance2 = wp.dot(to_light, to_light)
                 wi = wp.normalize(to_light)
-                cross = wp.cross(v1 - v0, v2 - v0)
+                extent = triangle_extent(v0, v1, v2)
+                cross = scaled_cross(v0, v1, v2, extent)
                 normal = wp.normalize(cross)
                 shading_normal = normal
                 if geometry.shapes[geometry.shape_of[light.primitive]].smooth == 1:
@@ -103,12 +114,12 @@ def make_light_sampler(kinds: tuple[str, ...], textures: tuple[str, ...]):
                 if wp.dot(shading_normal, normal) < 0.0:
                     normal = -normal
                 # Emission is towards the front of the geometric normal; the density in area, 2 / |cross|, becomes one
-                # in solid angle by distance^2 / cos.
+                # in solid angle by distance^2 / cos. Both lengths are in units of the extent.
                 cos_light = -wp.dot(normal, wi)
                 if cos_light > 0.0:
                     result.wi = wi
                     result.target = q + position_error(v0, v1, v2, b[0], b[1], normal) * normal
-                    result.pdf = light.pmf * 2.0 * distance2 / (cos_light * wp.length(cross))
+                    result.pdf = light.pmf * 2.0 * wp.length_sq(to_light / extent) / (cos_light * wp.length(cross))
                     uv = wp.vec2(0.0)
                     if wp.static(textured):
                         uv = b[0] * geometry.uvs[i0] + b[1] * geometry.uvs[i1] + b2 * geometry.uvs[i2]
@@ -170,8 +181,9 @@ def make_light_sampler(kinds: tuple[str, ...], textures: tuple[str, ...]):
                 v0 = geometry.points[geometry.indices[3 * light.primitive]]
                 v1 = geometry.points[geometry.indices[3 * light.primitive + 1]]
                 v2 = geometry.points[geometry.indices[3 * light.primitive + 2]]
-                area2 = wp.length(wp.cross(v1 - v0, v2 - v0))
-                pdf = 2.0 * wp.length_sq(q - p) / (wp.abs(wp.dot(normal, wi)) * area2)
+                extent = triangle_extent(v0, v1, v2)
+                cross = scaled_cross(v0, v1, v2, extent)
+                pdf = 2.0 * wp.length_sq((q - p) / extent) / (wp.abs(wp.dot(normal, wi)) * wp.length(cross))
         if wp.static(has_sphere):
             if light.kind == KIND_SPHERE:
                 sphere = geometry.spheres[light.primitive - geometry.triangle_count]

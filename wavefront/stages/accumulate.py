@@ -7,7 +7,7 @@ import functools
 import warp as wp
 
 from wavefront.film import FilmArrays, luminance
-from wavefront.queues import SAMPLE_COUNT, TILE_HEIGHT, TILE_WIDTH, TILE_X, TILE_Y, Paths
+from wavefront.queues import NONFINITE_ACCUMULATE, SAMPLE_COUNT, TILE_HEIGHT, TILE_WIDTH, TILE_X, TILE_Y, Paths
 
 
 @functools.cache
@@ -21,6 +21,7 @@ def make_accumulate(variance: bool):
         film_width: int,
         # out
         film: FilmArrays,
+        counters: wp.array[wp.int32],
     ):
         local = wp.tid()
         if local >= tile[TILE_WIDTH] * tile[TILE_HEIGHT]:
@@ -35,6 +36,9 @@ def make_accumulate(variance: bool):
             square = film.luminance_squared[pixel]
         for s in range(samples):
             L = paths.L[local * samples + s]
+            if not wp.isfinite(L):  # each contribution was finite, their sum overflowed
+                wp.atomic_add(counters, NONFINITE_ACCUMULATE, 1)
+                L = wp.vec3(0.0)
             total += wp.vec3d(wp.float64(L[0]), wp.float64(L[1]), wp.float64(L[2]))
             if wp.static(variance):
                 y_sample = wp.float64(luminance(L))
