@@ -11,6 +11,8 @@ from wavefront.accel.mesh_query import Geometry, Hit
 # Roundings in an interpolated position and in a ray-triangle test, in units of float32's 2^-24: a handful each (Higham
 # 2002, section 3.1), doubled to be safe.
 POSITION_ERROR = wp.constant(32.0 * 5.9604645e-8)
+# The same for a sphere, where fewer roundings meet: a large one, such as a ground, should not lose contact shadows.
+SPHERE_ERROR = wp.constant(10.0 * 5.9604645e-8)
 
 
 @wp.struct
@@ -112,7 +114,7 @@ def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
                     vertex.geometric_normal = -outwards
                 vertex.shading_normal = vertex.geometric_normal
                 # The intersection itself loses digits of |origin - centre|, but the point was put back onto the sphere.
-                vertex.offset = POSITION_ERROR * (wp.dot(wp.abs(center), wp.abs(outwards)) + sphere[3])
+                vertex.offset = SPHERE_ERROR * (wp.dot(wp.abs(center), wp.abs(outwards)) + sphere[3])
                 if wp.static(uvs):
                     vertex.uv = sphere_uv(geometry.sphere_to_local[index] * outwards)
         return vertex

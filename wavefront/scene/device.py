@@ -110,7 +110,7 @@ class _TextureAtlas:
         store = self.bytes if is_bytes else self.floats
         first = sum(part.size for part in store)
         store.append(pixels.ravel())
-        linear = pixels.reshape(-1, channels) / 255.0 if is_bytes else pixels.reshape(-1, channels)
+        linear = pixels.reshape(-1, channels) / 255.0 if is_bytes else np.maximum(pixels.reshape(-1, channels), 0.0)
         if is_bytes and srgb:
             linear = srgb_to_linear(linear)
         record = {
