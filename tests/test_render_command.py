@@ -133,7 +133,8 @@ def test_scene_hash_follows_the_scene_not_its_place(scene, tmp_path, capsys):
 def test_bad_arguments_are_one_line(scene, tmp_path, capsys, monkeypatch, arguments, message):
     monkeypatch.chdir(tmp_path)
     before = sorted(os.listdir(tmp_path))
-    status, error = run(capsys, scene, "--quiet", *arguments)
+    output = () if "-o" in arguments else ("-o", "out.exr")
+    status, error = run(capsys, scene, "--quiet", *output, *arguments)
     assert status == 2
     assert message in error
     assert error.count("\n") == 1 and "Traceback" not in error
@@ -149,6 +150,23 @@ def test_unwritable_output_is_refused_before_rendering(scene, tmp_path, capsys):
     (tmp_path / "out.json").mkdir()
     status, error = run(capsys, scene, "-o", tmp_path / "out.exr", "--quiet", "--spp", 10**9)
     assert (status, error) == (2, f"error: {tmp_path / 'out.json'}: cannot be written: it is a folder\n")
+
+
+def test_the_scene_is_never_overwritten(scene, tmp_path, capsys, monkeypatch):
+    """The account of a render has the scene's name by default: beside the scene that would replace it."""
+    monkeypatch.chdir(tmp_path)
+    before = scene.read_text()
+    status, error = run(capsys, "scene.json", "--quiet")
+    assert status == 2
+    assert (
+        error == "error: scene.json: would be overwritten, but the scene is read from it; choose another name with -o\n"
+    )
+    Image.new("RGB", (2, 2)).save(tmp_path / "out.png")
+    texture = ("--set", 'shapes[0].bsdf.reflectance={"type": "bitmap", "file": "out.png"}')
+    status, error = run(capsys, "scene.json", "-o", "out.exr", "--quiet", *texture)
+    assert status == 2
+    assert "out.png: would be overwritten" in error
+    assert scene.read_text() == before
 
 
 def test_half_overflow_is_an_error_and_loses_nothing(scene, tmp_path, capsys):

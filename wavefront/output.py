@@ -50,6 +50,22 @@ def check_writable(exr: Path) -> None:
         raise WavefrontError(f"{exr}: cannot be written: {error.strerror or error}") from None
 
 
+def check_not_read(exr: Path, source: str | os.PathLike, scene: description.Scene) -> None:
+    """Refuses an output that would replace the scene file, or an image or mesh of the scene.
+
+    Raises:
+        WavefrontError: Names the file.
+    """
+    read = {os.path.realpath(source)} | {
+        os.path.realpath(record.file) for _, record in walk(scene) if getattr(record, "file", None)
+    }
+    for path in output_paths(exr):
+        if os.path.realpath(path) in read:
+            raise WavefrontError(
+                f"{path}: would be overwritten, but the scene is read from it; choose another name with -o"
+            )
+
+
 def tone_map(image: np.ndarray, exposure: float = 0.0) -> np.ndarray:
     """8-bit sRGB from linear radiance, clipped at 1 after scaling by 2^exposure (IEC 61966-2-1).
 
@@ -64,26 +80,19 @@ def tone_map(image: np.ndarray, exposure: float = 0.0) -> np.ndarray:
 
 def scene_hash(scene: description.Scene) -> str:
     """SHA-256 of a scene: its records, with the contents of files in the place of their paths."""
-    digest = hashlib.sha256()
-    plain = msgspec.json.decode(msgspec.json.encode(scene, enc_hook=lambda array: np.asarray(array).tolist()))
+    plain = msgspec.to_builtins(scene)
     files = {}
     for _, record in walk(scene):
         file = getattr(record, "file", None)
         if file and file not in files:
-            with open(file, "rb") as stream:
-                files[file] = (
-                    hashlib.file_digest(stream, "sha256").hexdigest()
-                    if hasattr(hashlib, "file_digest")
-                    else hashlib.sha256(stream.read()).hexdigest()
-                )
+            files[file] = hashlib.sha256(Path(file).read_bytes()).hexdigest()
 
     def replace(value):
         if isinstance(value, dict):
             return {k: files.get(v, v) if k == "file" else replace(v) for k, v in value.items()}
         return [replace(v) for v in value] if isinstance(value, list) else value
 
-    digest.update(json.dumps(replace(plain), sort_keys=True).encode())
-    return digest.hexdigest()
+    return hashlib.sha256(json.dumps(replace(plain), sort_keys=True).encode()).hexdigest()
 
 
 def describe_render(renderer: Renderer, source: str, started: float) -> dict:

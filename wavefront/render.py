@@ -15,7 +15,7 @@ from rich.table import Table
 
 import wavefront
 from wavefront.errors import WavefrontError
-from wavefront.output import check_writable, describe_render, write_outputs
+from wavefront.output import check_not_read, check_writable, describe_render, write_outputs
 from wavefront.renderer import Renderer
 from wavefront.scene import json_format, load_scene
 
@@ -212,6 +212,7 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
     output = Path(arguments.output or Path(arguments.scene).with_suffix(".exr").name)
     check_writable(output)
     scene = load_scene(arguments.scene, overrides_from(arguments), definitions_from(arguments), warn)
+    check_not_read(output, arguments.scene, scene)
     renderer = Renderer(
         scene,
         device=arguments.device,
