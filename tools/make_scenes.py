@@ -30,8 +30,10 @@ from wavefront.scene.description import (
     Mesh,
     PathIntegrator,
     Perspective,
+    Plastic,
     RoughConductor,
     RoughDielectric,
+    RoughPlastic,
     Scene,
     Sphere,
     TwoSided,
@@ -214,6 +216,12 @@ def material_balls(folder: Path) -> dict[str, Scene]:
         ),
         "dielectric": ("clear glass", Dielectric(int_ior="bk7"), None),
         "rough-dielectric": ("ground glass", RoughDielectric(int_ior="bk7", alpha=0.15), None),
+        "plastic": ("a red base below a smooth coating", Plastic(diffuse_reflectance=[0.6, 0.08, 0.05]), None),
+        "rough-plastic": (
+            "an image below a rough coating, with colours that saturate",
+            RoughPlastic(diffuse_reflectance=tiles, alpha=0.15, nonlinear=True),
+            None,
+        ),
         "twosided": (
             "a bowl that is metal outside and diffuse inside",
             TwoSided(front=RoughConductor(material="Au", alpha=0.15), back=Diffuse(reflectance=[0.1, 0.3, 0.6])),

@@ -225,6 +225,25 @@ BSDFS = [
     ),
     ('<bsdf type="roughdielectric"/>', d.RoughDielectric(distribution="beckmann")),
     ('<bsdf type="roughdielectric"><float name="alpha" value="0"/></bsdf>', d.Dielectric()),
+    ('<bsdf type="plastic"/>', d.Plastic()),
+    (
+        '<bsdf type="plastic"><float name="int_ior" value="1.6"/><string name="ext_ior" value="water"/>'
+        '<rgb name="diffuse_reflectance" value="0.1 0.2 0.3"/><float name="specular_reflectance" value="0.75"/>'
+        '<boolean name="nonlinear" value="true"/></bsdf>',
+        d.Plastic(
+            int_ior=1.6,
+            ext_ior="water",
+            diffuse_reflectance=[0.1, 0.2, 0.3],
+            specular_reflectance=0.75,
+            nonlinear=True,
+        ),
+    ),
+    ('<bsdf type="roughplastic"/>', d.RoughPlastic(distribution="beckmann")),
+    (
+        '<bsdf type="roughplastic"><float name="alpha" value="0.3"/><string name="distribution" value="ggx"/>'
+        '<boolean name="nonlinear" value="true"/></bsdf>',
+        d.RoughPlastic(alpha=0.3, nonlinear=True),
+    ),
     ('<bsdf type="twosided"><bsdf type="diffuse"/></bsdf>', d.TwoSided(front=d.Diffuse())),
     (
         '<bsdf type="twosided"><bsdf type="diffuse"/><bsdf type="conductor"/></bsdf>',
@@ -435,7 +454,7 @@ def test_named_textures(load_xml):
 
 
 def test_unused_unsupported_bsdf_is_a_warning(load_xml):
-    scene = load_xml('<bsdf type="plastic" id="p"/>' + on_shape(""))
+    scene = load_xml('<bsdf type="pplastic" id="p"/>' + on_shape(""))
     assert scene.bsdfs == []
     assert any("line 2: bsdf 'p' is left out" in warning for warning in load_xml.warnings)
 

@@ -14,7 +14,7 @@ from wavefront.scene.validate import MESH_SUFFIXES, validate
 
 STEP = d.TransformStep
 STEPS = "translate, rotate, scale, look_at, matrix"
-REFLECTING = "diffuse, conductor, rough_conductor"
+REFLECTING = "diffuse, conductor, rough_conductor, plastic, rough_plastic"
 TOO_LARGE = "expected a number of at most 3.403e+38, as 32-bit floats are; found"
 
 
@@ -191,6 +191,12 @@ def test_a_scene_that_makes_no_sense_is_refused_with_the_place(scene, message):
     assert str(caught.value) == f"s.json: {message}"
 
 
+def test_unknown_indices_of_plastics_are_refused():
+    for bsdf in (d.Plastic(int_ior="plastik"), d.RoughPlastic(ext_ior="plastik")):
+        with pytest.raises(SceneError, match="unknown index of refraction 'plastik'"):
+            validate(with_bsdfs(bsdf))
+
+
 def test_unknown_metals_are_named_with_the_nearest():
     with pytest.raises(SceneError) as caught:
         validate(with_bsdfs(d.Conductor(material="TiO")))
@@ -223,6 +229,7 @@ def test_a_rotation_without_an_axis_is_refused():
     "scene",
     [
         with_bsdfs(d.Mask(name="m", bsdf="t"), d.TwoSided(name="t", front="d", back=d.Conductor(material="none"))),
+        with_bsdfs(d.TwoSided(front=d.Plastic(int_ior="water"), back=d.RoughPlastic(diffuse_reflectance=[1.0, 0.0, 0.5]))),
         with_bsdfs(d.Mask(bsdf=d.RoughDielectric()), d.Mask(bsdf=d.TwoSided(front=d.Diffuse()))),
         moved(STEP(scale=1e-6), STEP(scale=(1.0, 1e6, 1.0))),
         moved(STEP(scale=-3.0), STEP(rotate=d.Rotate(axis=(1.0, 2.0, 3.0), angle=77.0)), shape=d.Sphere),

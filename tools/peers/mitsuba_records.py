@@ -115,6 +115,18 @@ class _Writer:
             return {"type": "mask", "opacity": opacity, "nested": self._bsdf(bsdf.bsdf)}
         if isinstance(bsdf, description.Diffuse):
             return {"type": "diffuse", "reflectance": self._parameter(bsdf.reflectance)}
+        if isinstance(bsdf, (description.Plastic, description.RoughPlastic)):
+            result = {
+                "type": "plastic",
+                "int_ior": bsdf.int_ior,
+                "ext_ior": bsdf.ext_ior,
+                "nonlinear": bsdf.nonlinear,
+                "diffuse_reflectance": self._parameter(bsdf.diffuse_reflectance),
+                "specular_reflectance": self._parameter(bsdf.specular_reflectance),
+            }
+            if isinstance(bsdf, description.RoughPlastic):
+                result |= {"type": "roughplastic", "distribution": bsdf.distribution, "alpha": bsdf.alpha}
+            return result
         rough = isinstance(bsdf, (description.RoughConductor, description.RoughDielectric))
         result = {"specular_reflectance": self._parameter(bsdf.specular_reflectance)}
         if rough:

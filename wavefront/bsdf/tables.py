@@ -14,7 +14,17 @@ KIND_CONDUCTOR = wp.constant(2)
 KIND_ROUGH_CONDUCTOR = wp.constant(3)
 KIND_DIELECTRIC = wp.constant(4)
 KIND_ROUGH_DIELECTRIC = wp.constant(5)
-KINDS = {"diffuse": 1, "conductor": 2, "rough_conductor": 3, "dielectric": 4, "rough_dielectric": 5}
+KIND_PLASTIC = wp.constant(6)
+KIND_ROUGH_PLASTIC = wp.constant(7)
+KINDS = {
+    "diffuse": 1,
+    "conductor": 2,
+    "rough_conductor": 3,
+    "dielectric": 4,
+    "rough_dielectric": 5,
+    "plastic": 6,
+    "rough_plastic": 7,
+}
 TRANSMISSIVE = ("dielectric", "rough_dielectric")
 DELTA = ("conductor", "dielectric")
 
@@ -65,8 +75,26 @@ class DielectricRecord:
 
 
 @wp.struct
+class PlasticRecord:
+    """Smooth and rough; `alpha`, `distribution` and `first` are read for rough plastics only."""
+
+    eta: wp.float32  # interior over exterior index of refraction
+    internal_reflectance: wp.float32  # of the coating, for diffuse light from inside
+    nonlinear: wp.int32
+    diffuse: wp.vec3
+    diffuse_texture: wp.int32
+    reflectance: wp.vec3
+    reflectance_texture: wp.int32
+    alpha: wp.float32
+    distribution: wp.int32
+    first: wp.int32  # index into MaterialTables.coatings of the coating's transmittance
+
+
+@wp.struct
 class MaterialTables:
     materials: wp.array[Material]
     diffuse: wp.array[DiffuseRecord]
     conductor: wp.array[ConductorRecord]
     dielectric: wp.array[DielectricRecord]
+    plastic: wp.array[PlasticRecord]
+    coatings: wp.array[wp.float32]

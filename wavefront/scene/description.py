@@ -169,6 +169,36 @@ class RoughDielectric(Record, tag_field="type", tag="rough_dielectric"):
     distribution: Distribution = "ggx"
 
 
+class Plastic(Record, tag_field="type", tag="plastic"):
+    """A diffuse base below a smooth dielectric coating, one-sided."""
+
+    name: str = ""
+    int_ior: Annotated[IOR, Meta(description="Index of refraction of the coating, or a name.")] = 1.49
+    ext_ior: Annotated[IOR, Meta(description="Exterior index of refraction, or a name.")] = 1.000277
+    diffuse_reflectance: Reflectance = 0.5
+    specular_reflectance: Reflectance = 1.0
+    nonlinear: Annotated[bool, Meta(description="Let colours saturate by light that bounces below the coating.")] = (
+        False
+    )
+
+
+class RoughPlastic(Record, tag_field="type", tag="rough_plastic"):
+    """A diffuse base below a dielectric coating with a microfacet surface, one-sided."""
+
+    name: str = ""
+    int_ior: Annotated[IOR, Meta(description="Index of refraction of the coating, or a name.")] = 1.49
+    ext_ior: Annotated[IOR, Meta(description="Exterior index of refraction, or a name.")] = 1.000277
+    diffuse_reflectance: Reflectance = 0.5
+    specular_reflectance: Reflectance = 1.0
+    nonlinear: Annotated[bool, Meta(description="Let colours saturate by light that bounces below the coating.")] = (
+        False
+    )
+    alpha: Annotated[
+        float, Meta(ge=1e-4, le=1.0, description="Microfacet roughness (root mean square slope for Beckmann).")
+    ] = 0.1
+    distribution: Distribution = "ggx"
+
+
 class TwoSided(Record, tag_field="type", tag="twosided"):
     """A reflecting BSDF on both sides of a surface; `back` defaults to `front`."""
 
@@ -185,7 +215,7 @@ class Mask(Record, tag_field="type", tag="mask"):
     opacity: Opacity = 0.5
 
 
-Bsdf = Diffuse | Conductor | RoughConductor | Dielectric | RoughDielectric | TwoSided | Mask
+Bsdf = Diffuse | Conductor | RoughConductor | Dielectric | RoughDielectric | Plastic | RoughPlastic | TwoSided | Mask
 
 # --- emitters --------------------------------------------------------------------------------------------------
 

@@ -41,6 +41,8 @@ class Materials:
             "roughconductor": self._conductor,
             "dielectric": self._dielectric,
             "roughdielectric": self._dielectric,
+            "plastic": self._plastic,
+            "roughplastic": self._plastic,
             "twosided": self._twosided,
             "mask": self._mask,
             "null": self._null,
@@ -133,6 +135,21 @@ class Materials:
         if "alpha" in fields and _is_smooth(fields["alpha"]):
             del fields["alpha"], fields["distribution"]
         return (description.RoughDielectric if "alpha" in fields else description.Dielectric)(**fields)
+
+    def _plastic(self, plugin):
+        fields = {"nonlinear": plugin.boolean("nonlinear")}
+        for name, default in (("int_ior", 1.49), ("ext_ior", 1.000277)):
+            fields[name] = self._ior(plugin, name, default)
+        for name, default in (("diffuse_reflectance", 0.5), ("specular_reflectance", 1.0)):
+            fields[name] = self.colour(plugin, name, default, limit=1.0)
+        if plugin.type == "roughplastic":
+            if plugin.has("alpha_u") or plugin.has("alpha_v") or plugin.child("alpha") is not None:
+                raise plugin.error(f"{plugin.label()} needs one number alpha for both directions")
+            fields |= self._roughness(plugin)
+        plugin.finish("texture")
+        if "alpha" in fields and _is_smooth(fields["alpha"]):
+            del fields["alpha"], fields["distribution"]
+        return (description.RoughPlastic if "alpha" in fields else description.Plastic)(**fields)
 
     def _ior(self, plugin, name, default):
         element = plugin.get(name)
