@@ -28,6 +28,7 @@ from wavefront.scene.description import (
     Disk,
     Mask,
     Mesh,
+    Null,
     PathIntegrator,
     Perspective,
     Plastic,
@@ -36,6 +37,7 @@ from wavefront.scene.description import (
     RoughPlastic,
     Scene,
     Sphere,
+    ThinDielectric,
     TwoSided,
 )
 
@@ -216,6 +218,8 @@ def material_balls(folder: Path) -> dict[str, Scene]:
         ),
         "dielectric": ("clear glass", Dielectric(int_ior="bk7"), None),
         "rough-dielectric": ("ground glass", RoughDielectric(int_ior="bk7", alpha=0.15), None),
+        "thin-dielectric": ("a soap bubble's wall: a thin sheet of glass", ThinDielectric(int_ior="bk7"), None),
+        "null": ("a ball that is not there; the image shows the stage alone", Null(), None),
         "plastic": ("a red base below a smooth coating", Plastic(diffuse_reflectance=[0.6, 0.08, 0.05]), None),
         "rough-plastic": (
             "an image below a rough coating, with colours that saturate",

@@ -22,11 +22,13 @@ from wavefront.bsdf.microfacet import (
     smith_g1,
     visible_normal_pdf,
 )
+from wavefront.bsdf.null import sample_null
 from wavefront.bsdf.plastic import eval_plastic, sample_plastic
 from wavefront.bsdf.record import BsdfEval, BsdfSample
 from wavefront.bsdf.rough_conductor import eval_rough_conductor, sample_rough_conductor
 from wavefront.bsdf.rough_dielectric import eval_rough_dielectric, sample_rough_dielectric
 from wavefront.bsdf.rough_plastic import eval_rough_plastic, sample_rough_plastic
+from wavefront.bsdf.thin_dielectric import sample_thin_dielectric
 
 DEVICE = "cpu"
 LARGEST_UNIFORM = 1.0 - 2.0**-24
@@ -75,6 +77,16 @@ def call_sample_dielectric(p: Parameters, wo: wp.vec3, u: wp.vec3):
 @wp.func
 def call_sample_rough_dielectric(p: Parameters, wo: wp.vec3, u: wp.vec3):
     return sample_rough_dielectric(p.ior, p.reflectance, p.transmittance, p.alpha, p.distribution, wo, u)
+
+
+@wp.func
+def call_sample_thin_dielectric(p: Parameters, wo: wp.vec3, u: wp.vec3):
+    return sample_thin_dielectric(p.ior, p.reflectance, p.transmittance, wo, u)
+
+
+@wp.func
+def call_sample_null(p: Parameters, wo: wp.vec3, u: wp.vec3):
+    return sample_null(wo)
 
 
 @wp.func
@@ -152,6 +164,8 @@ _SAMPLE_KERNELS = {
     "rough_conductor": _sample_kernel(call_sample_rough_conductor),
     "dielectric": _sample_kernel(call_sample_dielectric),
     "rough_dielectric": _sample_kernel(call_sample_rough_dielectric),
+    "thin_dielectric": _sample_kernel(call_sample_thin_dielectric),
+    "null": _sample_kernel(call_sample_null),
     "plastic": _sample_kernel(call_sample_plastic),
     "rough_plastic": _sample_kernel(call_sample_rough_plastic),
 }

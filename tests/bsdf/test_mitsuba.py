@@ -1,5 +1,7 @@
 """Values and densities against Mitsuba 3, and its named materials."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -136,7 +138,10 @@ def test_smooth_weights():
     """Delta directions: Mitsuba's samples of each lobe, weights included."""
     eta, k = CONDUCTORS["Cu"]
     conductor = mi.load_dict({"type": "conductor", "material": "Cu"})
-    dielectric = mi.load_dict({"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0})
+    dielectrics = {
+        name: mi.load_dict({"type": name.replace("_", ""), "int_ior": 1.5, "ext_ior": 1.0})
+        for name in ("dielectric", "thin_dielectric")
+    }
     context, si = mi.BSDFContext(), mi.SurfaceInteraction3f()
     for cos_o in (0.9, 0.2, -0.3, -0.9):
         wo = harness.direction(cos_o)
@@ -146,8 +151,8 @@ def test_smooth_weights():
         np.testing.assert_allclose(ours.weight[0], np.array(weight), rtol=1e-5)
         if cos_o > 0.0:
             np.testing.assert_allclose(ours.wi[0], np.array(theirs.wo), atol=1e-6)
-        for u in (0.0, 0.999):
-            ours = harness.sample("dielectric", harness.parameters(ior=1.5), wo, np.array([[0.5, 0.5, u]]))
+        for (name, dielectric), u in itertools.product(dielectrics.items(), (0.0, 0.999)):
+            ours = harness.sample(name, harness.parameters(ior=1.5), wo, np.array([[0.5, 0.5, u]]))
             theirs, weight = dielectric.sample(context, si, u, [0.5, 0.5])
             np.testing.assert_allclose(ours.weight[0], np.array(weight), rtol=1e-5)
             np.testing.assert_allclose(ours.wi[0], np.array(theirs.wo), atol=1e-6)

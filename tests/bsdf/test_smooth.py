@@ -57,6 +57,38 @@ def test_dielectric(ior):
         np.testing.assert_array_equal(s.pdf, 0.0)
 
 
+@pytest.mark.parametrize("ior", [1.0001, 1.5, 4.0, 0.5])
+def test_thin_dielectric(ior):
+    """The share of reflection is the sum over reflections inside the sheet, the same from both sides; a pass is straight
+    on. Each sample carries all of the flux."""
+    ior = float(np.float32(ior))
+    for seed, cos_o in enumerate([1.0, 0.5, 0.05, -0.05, -0.5, -1.0]):
+        wo = harness.direction(cos_o)
+        p = harness.parameters((0.9, 0.5, 0.0), (0.3, 0.6, 1.0), ior=ior)
+        s = harness.sample("thin_dielectric", p, wo, harness.uniforms(N, seed))
+        f = oracle.fresnel(np.array([cos_o]), ior)[0]
+        # F, then into the sheet, once or three, five, ... times reflected inside, and out again
+        expected = f + (1.0 - f) ** 2 * sum(f ** (2 * k + 1) for k in range(4000))
+        reflected = s.wi[:, 2] * cos_o > 0.0
+        sigma = np.sqrt(expected * (1.0 - expected) / N)
+        assert abs(reflected.mean() - expected) <= 5.0 * sigma + 1e-6  # false-alarm rate 6e-7 each
+        mirror = np.where(reflected[:, None], wo * [-1.0, -1.0, 1.0], -wo)
+        np.testing.assert_allclose(s.wi, mirror, atol=1e-7)
+        tint = np.where(reflected[:, None], (0.9, 0.5, 0.0), (0.3, 0.6, 1.0))
+        np.testing.assert_allclose(s.weight, tint, rtol=1e-6)
+        np.testing.assert_array_equal(s.pdf, 0.0)
+        np.testing.assert_array_equal(s.eta, 1.0)
+
+
+def test_null_lets_everything_pass():
+    wo = harness.random_directions(100, 1)
+    s = harness.sample("null", harness.parameters(), wo, harness.uniforms(100, 2))
+    np.testing.assert_array_equal(s.wi, -wo)
+    np.testing.assert_array_equal(s.weight, 1.0)
+    np.testing.assert_array_equal(s.pdf, 0.0)
+    np.testing.assert_array_equal(s.eta, 1.0)
+
+
 def test_total_reflection_is_certain():
     """Even with the largest random number."""
     u = np.full((3, 3), harness.LARGEST_UNIFORM, dtype=np.float32)
@@ -109,7 +141,8 @@ def test_vanishing_roughness_is_smooth(distribution):
 
 ENDS = [0.0, 2.0**-24, 0.3, 0.5, 1.0 - 2.0**-23, harness.LARGEST_UNIFORM]
 ALL_KINDS = [
-    "diffuse", "conductor", "rough_conductor", "dielectric", "rough_dielectric", "plastic", "rough_plastic",
+    "diffuse", "conductor", "rough_conductor", "dielectric", "rough_dielectric", "plastic", "rough_plastic", "thin_dielectric",
+    "null",
 ]  # fmt: skip
 DENSE = ["diffuse", "rough_conductor", "rough_dielectric", "plastic", "rough_plastic"]
 COSINES = [1.0, 1.0 - 2.0**-24, 0.5, 1e-2, 1e-4, 1e-7, 1e-20, 1e-30, 0.0]

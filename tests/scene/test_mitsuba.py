@@ -250,7 +250,8 @@ BSDFS = [
         d.TwoSided(front=d.Diffuse(), back=d.Conductor(eta=0.0, k=1.0)),
     ),
     ('<bsdf type="mask"><bsdf type="diffuse"/></bsdf>', d.Mask(bsdf=d.Diffuse(), opacity=0.5)),
-    ('<bsdf type="null"/>', d.Mask(bsdf=d.Diffuse(reflectance=0.0), opacity=0.0)),
+    ('<bsdf type="null"/>', d.Null()),
+    ('<bsdf type="thindielectric"><float name="int_ior" value="1.5"/></bsdf>', d.ThinDielectric(int_ior=1.5)),
 ]
 
 
@@ -265,9 +266,11 @@ def test_mitsuba_reads_the_same_bsdfs(mi, body, expected):
 
 
 def test_default_indices_are_those_of_mitsuba(mi):
-    record = d.Dielectric()
-    eta = mi.traverse(mi.load_dict({"type": "dielectric"}))["eta"]
-    assert record.int_ior / record.ext_ior == pytest.approx(eta, rel=1e-6)
+    for record in (d.Dielectric(), d.RoughDielectric(), d.Plastic(), d.RoughPlastic()):
+        kind = record.__struct_config__.tag.replace("_", "")
+        eta = mi.traverse(mi.load_dict({"type": kind}))["eta"]
+        assert record.int_ior / record.ext_ior == pytest.approx(eta, rel=1e-6)
+    assert (d.ThinDielectric().int_ior, d.ThinDielectric().ext_ior) == (d.Dielectric().int_ior, d.Dielectric().ext_ior)
 
 
 @pytest.mark.parametrize(

@@ -63,6 +63,10 @@ def moved(*transform, shape=d.Rectangle):
             f"bsdfs[0].front: a twosided BSDF cannot hold dielectric; allowed: {REFLECTING}",
         ),
         (
+            with_bsdfs(d.TwoSided(front=d.ThinDielectric())),
+            f"bsdfs[0].front: a twosided BSDF cannot hold thin_dielectric; allowed: {REFLECTING}",
+        ),
+        (
             with_bsdfs(d.TwoSided(front=d.Diffuse(), back="m"), d.Mask(name="m", bsdf=d.Diffuse())),
             f"bsdfs[0].back: a twosided BSDF cannot hold mask; allowed: {REFLECTING}",
         ),
@@ -191,8 +195,8 @@ def test_a_scene_that_makes_no_sense_is_refused_with_the_place(scene, message):
     assert str(caught.value) == f"s.json: {message}"
 
 
-def test_unknown_indices_of_plastics_are_refused():
-    for bsdf in (d.Plastic(int_ior="plastik"), d.RoughPlastic(ext_ior="plastik")):
+def test_unknown_indices_of_refraction_are_refused():
+    for bsdf in (d.ThinDielectric(int_ior="plastik"), d.Plastic(int_ior="plastik"), d.RoughPlastic(ext_ior="plastik")):
         with pytest.raises(SceneError, match="unknown index of refraction 'plastik'"):
             validate(with_bsdfs(bsdf))
 

@@ -127,6 +127,8 @@ class _Writer:
             if isinstance(bsdf, description.RoughPlastic):
                 result |= {"type": "roughplastic", "distribution": bsdf.distribution, "alpha": bsdf.alpha}
             return result
+        if isinstance(bsdf, description.Null):
+            return {"type": "null"}
         rough = isinstance(bsdf, (description.RoughConductor, description.RoughDielectric))
         result = {"specular_reflectance": self._parameter(bsdf.specular_reflectance)}
         if rough:
@@ -137,8 +139,9 @@ class _Writer:
                 return result | {"material": bsdf.material}
             eta, k = (0.0, 1.0) if bsdf.eta is None else (bsdf.eta, bsdf.k)  # a perfect mirror
             return result | {"eta": self._parameter(eta), "k": self._parameter(k)}
+        thin = isinstance(bsdf, description.ThinDielectric)
         return result | {
-            "type": "roughdielectric" if rough else "dielectric",
+            "type": "thindielectric" if thin else "roughdielectric" if rough else "dielectric",
             "int_ior": bsdf.int_ior,
             "ext_ior": bsdf.ext_ior,
             "specular_transmittance": self._parameter(bsdf.specular_transmittance),

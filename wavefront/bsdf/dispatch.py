@@ -12,7 +12,9 @@ from wavefront.bsdf.tables import (
     KIND_CONDUCTOR,
     KIND_DIELECTRIC,
     KIND_NONE,
+    KIND_NULL,
     KIND_ROUGH_DIELECTRIC,
+    KIND_THIN_DIELECTRIC,
     Material,
     MaterialTables,
 )
@@ -21,8 +23,13 @@ from wavefront.warp_samples import orthonormal_basis, to_local, to_world
 
 
 @wp.func
+def is_delta_transmission(kind: int) -> bool:
+    return kind == KIND_DIELECTRIC or kind == KIND_THIN_DIELECTRIC or kind == KIND_NULL
+
+
+@wp.func
 def transmits(kind: int) -> bool:
-    return kind == KIND_DIELECTRIC or kind == KIND_ROUGH_DIELECTRIC
+    return is_delta_transmission(kind) or kind == KIND_ROUGH_DIELECTRIC
 
 
 @wp.func
@@ -34,7 +41,7 @@ def side_kind(material: Material, cos_o: float) -> int:
 def is_smooth(material: Material, cos_o: float) -> bool:
     """Whether the side that is seen has a part that is not a delta, so that a light sample can contribute."""
     kind = side_kind(material, cos_o)
-    return not (kind == KIND_NONE or kind == KIND_CONDUCTOR or kind == KIND_DIELECTRIC)
+    return not (kind == KIND_NONE or kind == KIND_CONDUCTOR or is_delta_transmission(kind))
 
 
 @functools.cache

@@ -10,6 +10,7 @@ from wavefront.bsdf.conductor import sample_conductor
 from wavefront.bsdf.dielectric import sample_dielectric
 from wavefront.bsdf.diffuse import eval_diffuse, sample_diffuse
 from wavefront.bsdf.fresnel import fresnel_conductor
+from wavefront.bsdf.null import sample_null
 from wavefront.bsdf.plastic import eval_plastic, sample_plastic
 from wavefront.bsdf.record import BsdfEval, BsdfSample
 from wavefront.bsdf.rough_conductor import eval_rough_conductor, sample_rough_conductor
@@ -19,12 +20,15 @@ from wavefront.bsdf.tables import (
     KIND_CONDUCTOR,
     KIND_DIELECTRIC,
     KIND_DIFFUSE,
+    KIND_NULL,
     KIND_PLASTIC,
     KIND_ROUGH_CONDUCTOR,
     KIND_ROUGH_DIELECTRIC,
     KIND_ROUGH_PLASTIC,
+    KIND_THIN_DIELECTRIC,
     MaterialTables,
 )
+from wavefront.bsdf.thin_dielectric import sample_thin_dielectric
 from wavefront.texture import TextureTables, make_eval_parameter
 
 MIN_ALPHA = wp.constant(1.0e-4)  # below, a microfacet lobe is too narrow for float32
@@ -69,6 +73,8 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
     has_rough_dielectric = "rough_dielectric" in kinds
     has_plastic = "plastic" in kinds
     has_rough_plastic = "rough_plastic" in kinds
+    has_thin_dielectric = "thin_dielectric" in kinds
+    has_null = "null" in kinds
     eval_parameter = make_eval_parameter(textures)
     eval_scalar = make_eval_scalar(textures)
 
@@ -216,6 +222,19 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
                     wo,
                     u,
                 )
+        if wp.static(has_thin_dielectric):
+            if kind == KIND_THIN_DIELECTRIC:
+                s = tables.dielectric[index]
+                result = sample_thin_dielectric(
+                    s.eta,
+                    eval_parameter(textures, s.reflectance, s.reflectance_texture, uv),
+                    eval_parameter(textures, s.transmittance, s.transmittance_texture, uv),
+                    wo,
+                    u,
+                )
+        if wp.static(has_null):
+            if kind == KIND_NULL:
+                result = sample_null(wo)
         return result
 
     @wp.func
@@ -234,14 +253,17 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
                     eval_parameter(textures, c.k, c.k_texture, uv),
                 )
                 albedo = wp.cw_mul(fresnel, eval_parameter(textures, c.reflectance, c.reflectance_texture, uv))
-        if wp.static(has_dielectric or has_rough_dielectric):
-            if kind == KIND_DIELECTRIC or kind == KIND_ROUGH_DIELECTRIC:
+        if wp.static(has_dielectric or has_rough_dielectric or has_thin_dielectric):
+            if kind == KIND_DIELECTRIC or kind == KIND_ROUGH_DIELECTRIC or kind == KIND_THIN_DIELECTRIC:
                 g = tables.dielectric[index]
                 albedo = eval_parameter(textures, g.transmittance, g.transmittance_texture, uv)
         if wp.static(has_plastic or has_rough_plastic):
             if kind == KIND_PLASTIC or kind == KIND_ROUGH_PLASTIC:
                 p = tables.plastic[index]
                 albedo = eval_parameter(textures, p.diffuse, p.diffuse_texture, uv)
+        if wp.static(has_null):
+            if kind == KIND_NULL:
+                albedo = wp.vec3(1.0)
         return albedo
 
     return eval_local, sample_local, albedo_local

@@ -16,6 +16,8 @@ KIND_DIELECTRIC = wp.constant(4)
 KIND_ROUGH_DIELECTRIC = wp.constant(5)
 KIND_PLASTIC = wp.constant(6)
 KIND_ROUGH_PLASTIC = wp.constant(7)
+KIND_THIN_DIELECTRIC = wp.constant(8)
+KIND_NULL = wp.constant(9)
 KINDS = {
     "diffuse": 1,
     "conductor": 2,
@@ -24,9 +26,11 @@ KINDS = {
     "rough_dielectric": 5,
     "plastic": 6,
     "rough_plastic": 7,
+    "thin_dielectric": 8,
+    "null": 9,
 }
-TRANSMISSIVE = ("dielectric", "rough_dielectric")
-DELTA = ("conductor", "dielectric")
+TRANSMISSIVE = ("dielectric", "rough_dielectric", "thin_dielectric", "null")
+DELTA = ("conductor", "dielectric", "thin_dielectric", "null")
 
 
 @wp.struct
@@ -62,7 +66,7 @@ class ConductorRecord:
 
 @wp.struct
 class DielectricRecord:
-    """Smooth and rough; `alpha` and `distribution` are read for rough dielectrics only."""
+    """Smooth, rough and thin; `alpha` and `distribution` are read for rough dielectrics only."""
 
     eta: wp.float32  # interior over exterior index of refraction
     reflectance: wp.vec3

@@ -199,6 +199,22 @@ class RoughPlastic(Record, tag_field="type", tag="rough_plastic"):
     distribution: Distribution = "ggx"
 
 
+class ThinDielectric(Record, tag_field="type", tag="thin_dielectric"):
+    """A thin sheet of glass, modelled by one surface: reflects and lets pass without refraction, both sides alike."""
+
+    name: str = ""
+    int_ior: Annotated[IOR, Meta(description="Index of refraction of the sheet, or a name.")] = 1.5046
+    ext_ior: Annotated[IOR, Meta(description="Exterior index of refraction, or a name.")] = 1.000277
+    specular_reflectance: Reflectance = 1.0
+    specular_transmittance: Reflectance = 1.0
+
+
+class Null(Record, tag_field="type", tag="null"):
+    """A surface that is not there: light passes. It can still emit."""
+
+    name: str = ""
+
+
 class TwoSided(Record, tag_field="type", tag="twosided"):
     """A reflecting BSDF on both sides of a surface; `back` defaults to `front`."""
 
@@ -215,7 +231,19 @@ class Mask(Record, tag_field="type", tag="mask"):
     opacity: Opacity = 0.5
 
 
-Bsdf = Diffuse | Conductor | RoughConductor | Dielectric | RoughDielectric | Plastic | RoughPlastic | TwoSided | Mask
+Bsdf = (
+    Diffuse
+    | Conductor
+    | RoughConductor
+    | Dielectric
+    | RoughDielectric
+    | ThinDielectric
+    | Plastic
+    | RoughPlastic
+    | Null
+    | TwoSided
+    | Mask
+)
 
 # --- emitters --------------------------------------------------------------------------------------------------
 

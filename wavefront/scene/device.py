@@ -28,6 +28,8 @@ BSDF_KINDS = {
     description.RoughConductor: "rough_conductor",
     description.Dielectric: "dielectric",
     description.RoughDielectric: "rough_dielectric",
+    description.ThinDielectric: "thin_dielectric",
+    description.Null: "null",
     description.Plastic: "plastic",
     description.RoughPlastic: "rough_plastic",
 }
@@ -242,6 +244,9 @@ class _Upload:
     def _bsdf(self, bsdf: description.Bsdf, where: str) -> tuple[int, int]:
         """Kind and record index of a BSDF that is neither two-sided nor a mask."""
         kind = BSDF_KINDS[type(bsdf)]
+        self.bsdf_kinds.add(kind)
+        if kind == "null":
+            return bsdf_tables.KINDS[kind], 0  # has no parameters, hence no record
         record: dict = {}
         if kind == "diffuse":
             table = "diffuse"
@@ -276,7 +281,6 @@ class _Upload:
         if kind in ("rough_conductor", "rough_dielectric"):
             self._set(record, "alpha", bsdf.alpha, f"{where}.alpha", scalar=True)
             record["distribution"] = DISTRIBUTIONS[bsdf.distribution]
-        self.bsdf_kinds.add(kind)
         self.bsdfs[table].append(record)
         return bsdf_tables.KINDS[kind], len(self.bsdfs[table]) - 1
 

@@ -41,6 +41,7 @@ class Materials:
             "roughconductor": self._conductor,
             "dielectric": self._dielectric,
             "roughdielectric": self._dielectric,
+            "thindielectric": self._dielectric,
             "plastic": self._plastic,
             "roughplastic": self._plastic,
             "twosided": self._twosided,
@@ -134,6 +135,8 @@ class Materials:
         plugin.finish("texture")
         if "alpha" in fields and _is_smooth(fields["alpha"]):
             del fields["alpha"], fields["distribution"]
+        if plugin.type == "thindielectric":
+            return description.ThinDielectric(**fields)
         return (description.RoughDielectric if "alpha" in fields else description.Dielectric)(**fields)
 
     def _plastic(self, plugin):
@@ -202,8 +205,7 @@ class Materials:
 
     def _null(self, plugin):
         plugin.finish()
-        # a surface that is not there: light passes, and it can still emit
-        return description.Mask(opacity=0.0, bsdf=description.Diffuse(reflectance=0.0))
+        return description.Null()
 
     # --- colours and textures ----------------------------------------------------------------------------------
 
