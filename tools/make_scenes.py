@@ -29,6 +29,7 @@ from wavefront.scene.description import (
     Mask,
     Mesh,
     Null,
+    OrenNayar,
     PathIntegrator,
     Perspective,
     Plastic,
@@ -209,6 +210,7 @@ def material_balls(folder: Path) -> dict[str, Scene]:
     scenes = {
         "diffuse": ("diffuse reflection", Diffuse(reflectance=[0.7, 0.25, 0.12]), None),
         "diffuse-bitmap": ("diffuse reflection from an image", Diffuse(reflectance=tiles), None),
+        "oren-nayar": ("rough diffuse clay", OrenNayar(reflectance=[0.7, 0.25, 0.12], roughness=0.9), None),
         "conductor": ("a smooth metal, gold", Conductor(material="Au"), None),
         "rough-conductor-ggx": ("a rough metal, GGX", RoughConductor(material="Cu", alpha=0.2), None),
         "rough-conductor-beckmann": (

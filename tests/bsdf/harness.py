@@ -23,6 +23,7 @@ from wavefront.bsdf.microfacet import (
     visible_normal_pdf,
 )
 from wavefront.bsdf.null import sample_null
+from wavefront.bsdf.oren_nayar import eval_oren_nayar, sample_oren_nayar
 from wavefront.bsdf.plastic import eval_plastic, sample_plastic
 from wavefront.bsdf.record import BsdfEval, BsdfSample
 from wavefront.bsdf.rough_conductor import eval_rough_conductor, sample_rough_conductor
@@ -87,6 +88,16 @@ def call_sample_thin_dielectric(p: Parameters, wo: wp.vec3, u: wp.vec3):
 @wp.func
 def call_sample_null(p: Parameters, wo: wp.vec3, u: wp.vec3):
     return sample_null(wo)
+
+
+@wp.func
+def call_sample_oren_nayar(p: Parameters, wo: wp.vec3, u: wp.vec3):
+    return sample_oren_nayar(p.reflectance, p.alpha, wo, u)
+
+
+@wp.func
+def call_eval_oren_nayar(p: Parameters, wo: wp.vec3, wi: wp.vec3):
+    return eval_oren_nayar(p.reflectance, p.alpha, wo, wi)
 
 
 @wp.func
@@ -166,6 +177,7 @@ _SAMPLE_KERNELS = {
     "rough_dielectric": _sample_kernel(call_sample_rough_dielectric),
     "thin_dielectric": _sample_kernel(call_sample_thin_dielectric),
     "null": _sample_kernel(call_sample_null),
+    "oren_nayar": _sample_kernel(call_sample_oren_nayar),
     "plastic": _sample_kernel(call_sample_plastic),
     "rough_plastic": _sample_kernel(call_sample_rough_plastic),
 }
@@ -173,6 +185,7 @@ _EVAL_KERNELS = {
     "diffuse": _eval_kernel(call_eval_diffuse),
     "rough_conductor": _eval_kernel(call_eval_rough_conductor),
     "rough_dielectric": _eval_kernel(call_eval_rough_dielectric),
+    "oren_nayar": _eval_kernel(call_eval_oren_nayar),
     "plastic": _eval_kernel(call_eval_plastic),
     "rough_plastic": _eval_kernel(call_eval_rough_plastic),
 }

@@ -456,6 +456,15 @@ def test_named_textures(load_xml):
     assert [texture.name for texture in scene.textures] == ["t"]
 
 
+@pytest.mark.parametrize(("alpha", "roughness"), [(0.0, 0.0), (0.2, 0.0842246), (1.0, 0.5457335)])
+def test_rough_diffuse_of_mitsuba_0(load_xml, alpha, roughness):
+    """The ratio of the terms of Oren and Nayar's qualitative model at sigma = alpha / sqrt(2)."""
+    body = f'<bsdf type="roughdiffuse"><float name="alpha" value="{alpha}"/><boolean name="useFastApprox" value="true"/>'
+    found = bsdf_of(load_xml(on_shape(body + '<rgb name="reflectance" value="0.1 0.2 0.3"/></bsdf>'), "0.6.0"))
+    assert found.reflectance == [0.1, 0.2, 0.3]
+    assert found.roughness == pytest.approx(roughness, rel=1e-5, abs=1e-9)
+
+
 def test_unused_unsupported_bsdf_is_a_warning(load_xml):
     scene = load_xml('<bsdf type="pplastic" id="p"/>' + on_shape(""))
     assert scene.bsdfs == []

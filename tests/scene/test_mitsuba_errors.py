@@ -36,6 +36,7 @@ ERRORS = [
     (bsdf("roughplastic", '<float name="alpha_u" value="0.2"/>'), 2, "needs one number alpha"),
     (bsdf("roughplastic", '<texture name="alpha" type="checkerboard"/>'), 2, "needs one number alpha"),
     (bsdf("plastic", '<rgb name="diffuse_reflectance" value="1 2 1"/>'), 2, "must be from 0 to 1"),
+    (bsdf("roughdiffuse", '<texture name="alpha" type="checkerboard"/>'), 2, "needs a number alpha"),
     (bsdf("bumpmap"), 2, "bsdf 'bumpmap' is not supported yet"),
     ('<emitter type="point"/>', 2, "emitter 'point' is not supported; supported: area, constant"),
     ('<emitter type="area"/>', 2, "belongs inside a shape"),

@@ -127,6 +127,8 @@ class _Writer:
             if isinstance(bsdf, description.RoughPlastic):
                 result |= {"type": "roughplastic", "distribution": bsdf.distribution, "alpha": bsdf.alpha}
             return result
+        if isinstance(bsdf, description.OrenNayar):
+            raise WavefrontError("Mitsuba 3 has no oren_nayar BSDF")
         if isinstance(bsdf, description.Null):
             return {"type": "null"}
         rough = isinstance(bsdf, (description.RoughConductor, description.RoughDielectric))

@@ -11,6 +11,7 @@ from wavefront.bsdf.dielectric import sample_dielectric
 from wavefront.bsdf.diffuse import eval_diffuse, sample_diffuse
 from wavefront.bsdf.fresnel import fresnel_conductor
 from wavefront.bsdf.null import sample_null
+from wavefront.bsdf.oren_nayar import eval_oren_nayar, sample_oren_nayar
 from wavefront.bsdf.plastic import eval_plastic, sample_plastic
 from wavefront.bsdf.record import BsdfEval, BsdfSample
 from wavefront.bsdf.rough_conductor import eval_rough_conductor, sample_rough_conductor
@@ -21,6 +22,7 @@ from wavefront.bsdf.tables import (
     KIND_DIELECTRIC,
     KIND_DIFFUSE,
     KIND_NULL,
+    KIND_OREN_NAYAR,
     KIND_PLASTIC,
     KIND_ROUGH_CONDUCTOR,
     KIND_ROUGH_DIELECTRIC,
@@ -75,6 +77,7 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
     has_rough_plastic = "rough_plastic" in kinds
     has_thin_dielectric = "thin_dielectric" in kinds
     has_null = "null" in kinds
+    has_oren_nayar = "oren_nayar" in kinds
     eval_parameter = make_eval_parameter(textures)
     eval_scalar = make_eval_scalar(textures)
 
@@ -87,6 +90,15 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
             if kind == KIND_DIFFUSE:
                 d = tables.diffuse[index]
                 result = eval_diffuse(eval_parameter(textures, d.reflectance, d.reflectance_texture, uv), wo, wi)
+        if wp.static(has_oren_nayar):
+            if kind == KIND_OREN_NAYAR:
+                n = tables.oren_nayar[index]
+                result = eval_oren_nayar(
+                    eval_parameter(textures, n.reflectance, n.reflectance_texture, uv),
+                    wp.clamp(eval_scalar(textures, n.roughness, n.roughness_texture, uv), 0.0, 1.0),
+                    wo,
+                    wi,
+                )
         if wp.static(has_rough_conductor):
             if kind == KIND_ROUGH_CONDUCTOR:
                 c = tables.conductor[index]
@@ -150,6 +162,15 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
             if kind == KIND_DIFFUSE:
                 d = tables.diffuse[index]
                 result = sample_diffuse(eval_parameter(textures, d.reflectance, d.reflectance_texture, uv), wo, u)
+        if wp.static(has_oren_nayar):
+            if kind == KIND_OREN_NAYAR:
+                n = tables.oren_nayar[index]
+                result = sample_oren_nayar(
+                    eval_parameter(textures, n.reflectance, n.reflectance_texture, uv),
+                    wp.clamp(eval_scalar(textures, n.roughness, n.roughness_texture, uv), 0.0, 1.0),
+                    wo,
+                    u,
+                )
         if wp.static(has_conductor):
             if kind == KIND_CONDUCTOR:
                 m = tables.conductor[index]
@@ -244,6 +265,10 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
             if kind == KIND_DIFFUSE:
                 d = tables.diffuse[index]
                 albedo = eval_parameter(textures, d.reflectance, d.reflectance_texture, uv)
+        if wp.static(has_oren_nayar):
+            if kind == KIND_OREN_NAYAR:
+                n = tables.oren_nayar[index]
+                albedo = eval_parameter(textures, n.reflectance, n.reflectance_texture, uv)
         if wp.static(has_conductor or has_rough_conductor):
             if kind == KIND_CONDUCTOR or kind == KIND_ROUGH_CONDUCTOR:
                 c = tables.conductor[index]

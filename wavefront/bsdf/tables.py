@@ -18,6 +18,7 @@ KIND_PLASTIC = wp.constant(6)
 KIND_ROUGH_PLASTIC = wp.constant(7)
 KIND_THIN_DIELECTRIC = wp.constant(8)
 KIND_NULL = wp.constant(9)
+KIND_OREN_NAYAR = wp.constant(10)
 KINDS = {
     "diffuse": 1,
     "conductor": 2,
@@ -28,6 +29,7 @@ KINDS = {
     "rough_plastic": 7,
     "thin_dielectric": 8,
     "null": 9,
+    "oren_nayar": 10,
 }
 TRANSMISSIVE = ("dielectric", "rough_dielectric", "thin_dielectric", "null")
 DELTA = ("conductor", "dielectric", "thin_dielectric", "null")
@@ -47,6 +49,14 @@ class Material:
 class DiffuseRecord:
     reflectance: wp.vec3
     reflectance_texture: wp.int32
+
+
+@wp.struct
+class OrenNayarRecord:
+    reflectance: wp.vec3
+    reflectance_texture: wp.int32
+    roughness: wp.float32
+    roughness_texture: wp.int32
 
 
 @wp.struct
@@ -101,4 +111,5 @@ class MaterialTables:
     conductor: wp.array[ConductorRecord]
     dielectric: wp.array[DielectricRecord]
     plastic: wp.array[PlasticRecord]
+    oren_nayar: wp.array[OrenNayarRecord]
     coatings: wp.array[wp.float32]

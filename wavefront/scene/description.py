@@ -118,6 +118,14 @@ class Diffuse(Record, tag_field="type", tag="diffuse"):
     reflectance: Reflectance = 0.5
 
 
+class OrenNayar(Record, tag_field="type", tag="oren_nayar"):
+    """Rough diffuse reflection (Oren and Nayar 1994 in Fujii's improved form), one-sided."""
+
+    name: str = ""
+    reflectance: Reflectance = 0.5
+    roughness: Annotated[Opacity, Meta(description="0: Lambertian; 1: as rough as the model goes.")] = 0.5
+
+
 class Conductor(Record, tag_field="type", tag="conductor"):
     """Smooth conductor with a complex index of refraction."""
 
@@ -233,6 +241,7 @@ class Mask(Record, tag_field="type", tag="mask"):
 
 Bsdf = (
     Diffuse
+    | OrenNayar
     | Conductor
     | RoughConductor
     | Dielectric

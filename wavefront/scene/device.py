@@ -24,6 +24,7 @@ from wavefront.texture import WRAP_MODES, TextureRecord, TextureTables, srgb_to_
 DISTRIBUTIONS = {"ggx": 0, "beckmann": 1}
 BSDF_KINDS = {
     description.Diffuse: "diffuse",
+    description.OrenNayar: "oren_nayar",
     description.Conductor: "conductor",
     description.RoughConductor: "rough_conductor",
     description.Dielectric: "dielectric",
@@ -162,7 +163,7 @@ class _Upload:
         self.scene, self.device = scene, device
         self.atlas = _TextureAtlas()
         self.materials: list[dict] = []
-        self.bsdfs: dict[str, list[dict]] = {"diffuse": [], "conductor": [], "dielectric": [], "plastic": []}
+        self.bsdfs: dict[str, list[dict]] = {"diffuse": [], "conductor": [], "dielectric": [], "plastic": [], "oren_nayar": []}
         self.coatings: list[np.ndarray] = []
         self.bsdf_kinds: set[str] = set()
         self.known_materials: dict[int, int] = {}
@@ -183,6 +184,7 @@ class _Upload:
         materials.conductor = _struct_array(bsdf_tables.ConductorRecord, self.bsdfs["conductor"], self.device)
         materials.dielectric = _struct_array(bsdf_tables.DielectricRecord, self.bsdfs["dielectric"], self.device)
         materials.plastic = _struct_array(bsdf_tables.PlasticRecord, self.bsdfs["plastic"], self.device)
+        materials.oren_nayar = _struct_array(bsdf_tables.OrenNayarRecord, self.bsdfs["oren_nayar"], self.device)
         coatings = np.concatenate([np.zeros(0), *self.coatings])
         materials.coatings = wp.array(coatings, dtype=wp.float32, device=self.device)
         return DeviceScene(
@@ -251,6 +253,10 @@ class _Upload:
         if kind == "diffuse":
             table = "diffuse"
             self._set(record, "reflectance", bsdf.reflectance, f"{where}.reflectance")
+        elif kind == "oren_nayar":
+            table = "oren_nayar"
+            self._set(record, "reflectance", bsdf.reflectance, f"{where}.reflectance")
+            self._set(record, "roughness", bsdf.roughness, f"{where}.roughness", scalar=True)
         elif kind in ("conductor", "rough_conductor"):
             table = "conductor"
             eta, k = CONDUCTORS[bsdf.material] if bsdf.material is not None else (bsdf.eta, bsdf.k)

@@ -16,6 +16,7 @@ TEXTURE_FIELDS = frozenset(
         "specular_reflectance",
         "specular_transmittance",
         "alpha",
+        "roughness",
         "opacity",
         "radiance",
         "eta",

@@ -37,6 +37,7 @@ class Materials:
         self.named = {plugin.id: plugin for plugin in top if plugin.id and plugin.tag in ("bsdf", "texture")}
         self._bsdfs = {
             "diffuse": self._diffuse,
+            "roughdiffuse": self._rough_diffuse,
             "conductor": self._conductor,
             "roughconductor": self._conductor,
             "dielectric": self._dielectric,
@@ -92,6 +93,23 @@ class Materials:
         record = description.Diffuse(reflectance=self.colour(plugin, "reflectance", 0.5, limit=1.0))
         plugin.finish("texture")
         return record
+
+    def _rough_diffuse(self, plugin):
+        """Of Mitsuba 0.x; its alpha is a slope, of which Oren and Nayar's sigma is alpha / sqrt(2).
+
+        The roughness is the one that gives the model's two terms, A + B ..., the same ratio (Oren and Nayar 1994, section
+        4.2, without interreflection).
+        """
+        reflectance = self.colour(plugin, "reflectance", 0.5, limit=1.0)
+        alpha = self.scalar(plugin, "alpha", 0.2)
+        plugin.ignore("use_fast_approx")
+        plugin.finish("texture")
+        if not isinstance(alpha, float):
+            raise plugin.error(f"{plugin.label()} needs a number alpha; a texture is not supported")
+        variance = 0.5 * alpha * alpha
+        a = 1.0 - 0.5 * variance / (variance + 0.33)
+        b = 0.45 * variance / (variance + 0.09)
+        return description.OrenNayar(reflectance=reflectance, roughness=b / a)
 
     def _conductor(self, plugin):
         fields = self._conductor_spectrum(plugin)

@@ -16,7 +16,7 @@ from wavefront.scene.transforms import to_matrix
 
 MESH_SUFFIXES = (".ply", ".obj", ".gltf", ".glb")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
-_REFLECTING = ("diffuse", "conductor", "rough_conductor", "plastic", "rough_plastic")
+_REFLECTING = ("diffuse", "oren_nayar", "conductor", "rough_conductor", "plastic", "rough_plastic")
 _LARGEST = float(np.finfo(np.float32).max)
 
 
