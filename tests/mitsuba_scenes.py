@@ -218,7 +218,13 @@ MIXED: dict[str, list[str]] = {
 # Elements of the sensor, and the size of the film.
 CAMERAS: dict[str, tuple[str, tuple[int, int]]] = {
     axis: (f'<string name="fov_axis" value="{axis}"/>', size)
-    for axis, size in (("x", (48, 24)), ("y", (48, 24)), ("diagonal", (48, 24)), ("smaller", (24, 48)), ("larger", (24, 48)))
+    for axis, size in (
+        ("x", (48, 24)),
+        ("y", (48, 24)),
+        ("diagonal", (48, 24)),
+        ("smaller", (24, 48)),
+        ("larger", (24, 48)),
+    )
 }
 
 

@@ -1,4 +1,4 @@
-"""The rough diffuse BSDF: Mitsuba 3 has none, so its formula in float64 and its energy in closed form are the oracles."""
+"""The rough diffuse BSDF. Mitsuba 3 has none: the oracles are its formula in float64 and its energy in closed form."""
 
 import numpy as np
 import pytest

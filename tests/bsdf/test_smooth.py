@@ -59,8 +59,8 @@ def test_dielectric(ior):
 
 @pytest.mark.parametrize("ior", [1.0001, 1.5, 4.0, 0.5])
 def test_thin_dielectric(ior):
-    """The share of reflection is the sum over reflections inside the sheet, the same from both sides; a pass is straight
-    on. Each sample carries all of the flux."""
+    """The share of reflection is the sum over reflections inside the sheet, the same from both sides; a pass is
+    straight on. Each sample carries all of the flux."""
     ior = float(np.float32(ior))
     for seed, cos_o in enumerate([1.0, 0.5, 0.05, -0.05, -0.5, -1.0]):
         wo = harness.direction(cos_o)
@@ -141,8 +141,8 @@ def test_vanishing_roughness_is_smooth(distribution):
 
 ENDS = [0.0, 2.0**-24, 0.3, 0.5, 1.0 - 2.0**-23, harness.LARGEST_UNIFORM]
 ALL_KINDS = [
-    "diffuse", "conductor", "rough_conductor", "dielectric", "rough_dielectric", "plastic", "rough_plastic", "thin_dielectric",
-    "null", "oren_nayar",
+    "diffuse", "conductor", "rough_conductor", "dielectric", "rough_dielectric", "plastic", "rough_plastic",
+    "thin_dielectric", "null", "oren_nayar",
 ]  # fmt: skip
 DENSE = ["diffuse", "rough_conductor", "rough_dielectric", "plastic", "rough_plastic", "oren_nayar"]
 COSINES = [1.0, 1.0 - 2.0**-24, 0.5, 1e-2, 1e-4, 1e-7, 1e-20, 1e-30, 0.0]

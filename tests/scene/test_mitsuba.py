@@ -459,7 +459,8 @@ def test_named_textures(load_xml):
 @pytest.mark.parametrize(("alpha", "roughness"), [(0.0, 0.0), (0.2, 0.0842246), (1.0, 0.5457335)])
 def test_rough_diffuse_of_mitsuba_0(load_xml, alpha, roughness):
     """The ratio of the terms of Oren and Nayar's qualitative model at sigma = alpha / sqrt(2)."""
-    body = f'<bsdf type="roughdiffuse"><float name="alpha" value="{alpha}"/><boolean name="useFastApprox" value="true"/>'
+    body = f'<bsdf type="roughdiffuse"><float name="alpha" value="{alpha}"/>'
+    body += '<boolean name="useFastApprox" value="true"/>'
     found = bsdf_of(load_xml(on_shape(body + '<rgb name="reflectance" value="0.1 0.2 0.3"/></bsdf>'), "0.6.0"))
     assert found.reflectance == [0.1, 0.2, 0.3]
     assert found.roughness == pytest.approx(roughness, rel=1e-5, abs=1e-9)

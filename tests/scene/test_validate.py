@@ -239,7 +239,9 @@ def test_a_rotation_without_an_axis_is_refused():
     [
         with_bsdfs(d.Mask(name="m", bsdf="t"), d.TwoSided(name="t", front="d", back=d.Conductor(material="none"))),
         with_bsdfs(d.TwoSided(front=d.OrenNayar(roughness=d.Checkerboard(color0=0.0, color1=1.0)))),
-        with_bsdfs(d.TwoSided(front=d.Plastic(int_ior="water"), back=d.RoughPlastic(diffuse_reflectance=[1.0, 0.0, 0.5]))),
+        with_bsdfs(
+            d.TwoSided(front=d.Plastic(int_ior="water"), back=d.RoughPlastic(diffuse_reflectance=[1.0, 0.0, 0.5]))
+        ),
         with_bsdfs(d.Mask(bsdf=d.RoughDielectric()), d.Mask(bsdf=d.TwoSided(front=d.Diffuse()))),
         moved(STEP(scale=1e-6), STEP(scale=(1.0, 1e6, 1.0))),
         moved(STEP(scale=-3.0), STEP(rotate=d.Rotate(axis=(1.0, 2.0, 3.0), angle=77.0)), shape=d.Sphere),

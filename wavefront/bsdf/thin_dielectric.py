@@ -1,8 +1,8 @@
 """A thin sheet of a dielectric, such as a window pane modelled by one surface: both sides alike.
 
-Light enters the sheet and is reflected inside any number of times. With F of one boundary, what comes back is
-F + (1 - F)^2 F (1 + F^2 + ...) = 2 F / (1 + F), and the rest, (1 - F) / (1 + F), passes without a change of direction
-(as `thindielectric` of Mitsuba 3). Inside a sheet without absorption nothing is lost, and radiance scales with no index.
+Light enters the sheet and is reflected inside any number of times. With F of one boundary, what comes back is F + (1
+- F)^2 F (1 + F^2 + ...) = 2 F / (1 + F), and the rest, (1 - F) / (1 + F), passes without a change of direction (as
+`thindielectric` of Mitsuba 3). In a sheet without absorption nothing is lost, and radiance scales with no index.
 """
 
 import warp as wp

@@ -163,7 +163,13 @@ class _Upload:
         self.scene, self.device = scene, device
         self.atlas = _TextureAtlas()
         self.materials: list[dict] = []
-        self.bsdfs: dict[str, list[dict]] = {"diffuse": [], "conductor": [], "dielectric": [], "plastic": [], "oren_nayar": []}
+        self.bsdfs: dict[str, list[dict]] = {
+            "diffuse": [],
+            "conductor": [],
+            "dielectric": [],
+            "plastic": [],
+            "oren_nayar": [],
+        }
         self.coatings: list[np.ndarray] = []
         self.bsdf_kinds: set[str] = set()
         self.known_materials: dict[int, int] = {}

@@ -97,8 +97,8 @@ class Materials:
     def _rough_diffuse(self, plugin):
         """Of Mitsuba 0.x; its alpha is a slope, of which Oren and Nayar's sigma is alpha / sqrt(2).
 
-        The roughness is the one that gives the model's two terms, A + B ..., the same ratio (Oren and Nayar 1994, section
-        4.2, without interreflection).
+        The roughness is the one that gives the model's two terms, A + B ..., the same ratio (Oren and Nayar 1994,
+        section 4.2, without interreflection).
         """
         reflectance = self.colour(plugin, "reflectance", 0.5, limit=1.0)
         alpha = self.scalar(plugin, "alpha", 0.2)
