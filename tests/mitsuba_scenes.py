@@ -84,6 +84,10 @@ EVERYTHING = "\n  ".join(
         _speck(f'<bsdf type="roughconductor">{METAL}</bsdf>', 0.3),
         _speck('<bsdf type="dielectric"/>', 0.4),
         _speck('<bsdf type="roughdielectric"/>', 0.5),
+        _speck('<bsdf type="thindielectric"/>', 1.0),
+        _speck('<bsdf type="null"/>', 1.1),
+        _speck('<bsdf type="plastic"/>', 0.8),
+        _speck('<bsdf type="roughplastic"/>', 0.9),
         _speck("", 0.6, '<emitter type="area"><rgb name="radiance" value="1"/></emitter>'),
         _speck("", 0.7, '<emitter type="area"><rgb name="radiance" value="1"/></emitter>', "sphere"),
     ]
@@ -124,6 +128,8 @@ def _texture(parameter: str, wrap: str = "repeat", scale: float = 2.6, raw: bool
 
 _PAINT = '<bsdf type="diffuse"><rgb name="reflectance" value="{}"/></bsdf>'
 _GLASS = '<float name="int_ior" value="1.5"/><float name="ext_ior" value="1"/>'
+_COLOURS = '<rgb name="diffuse_reflectance" value="0.8, 0.4, 0.1"/><rgb name="specular_reflectance" value="0.9"/>'
+_NONLINEAR = '<boolean name="nonlinear" value="true"/>'
 _CHECKS = """<texture name="reflectance" type="checkerboard">
       <rgb name="color0" value="0.9, 0.6, 0.1"/><rgb name="color1" value="0.1, 0.2, 0.5"/>
       <transform name="to_uv"><scale x="3" y="2"/></transform>
@@ -182,6 +188,18 @@ MIXED: dict[str, list[str]] = {
     "dielectric": [FLOOR, SKY, ball(f'<bsdf type="dielectric">{_GLASS}</bsdf>')],
     "rough dielectric, GGX": [FLOOR, SKY, ball(_rough("roughdielectric", "ggx", 0.3, _GLASS))],
     "rough dielectric, Beckmann": [FLOOR, SKY, ball(_rough("roughdielectric", "beckmann", 0.3, _GLASS))],
+    "thin dielectric": [FLOOR, LAMP, SKY, panel(f'<bsdf type="thindielectric">{_GLASS}</bsdf>')],
+    "null": [FLOOR, LAMP, SKY, ball('<bsdf type="null"/>')],
+    "plastic": [FLOOR, LAMP, SKY, ball(f'<bsdf type="plastic">{_GLASS}{_COLOURS}</bsdf>')],
+    "plastic, nonlinear": [FLOOR, LAMP, SKY, ball(f'<bsdf type="plastic">{_GLASS}{_COLOURS}{_NONLINEAR}</bsdf>')],
+    "rough plastic, GGX": [FLOOR, LAMP, SKY, ball(_rough("roughplastic", "ggx", 0.2, _GLASS + _COLOURS + _NONLINEAR))],
+    "rough plastic, Beckmann": [FLOOR, LAMP, SKY, ball(_rough("roughplastic", "beckmann", 0.3, _GLASS + _COLOURS))],
+    "rough plastic, bitmap": [
+        FLOOR,
+        LAMP,
+        SKY,
+        panel(_rough("roughplastic", "ggx", 0.2, _GLASS + _NONLINEAR + _texture("diffuse_reflectance"))),
+    ],
     "opacity": [
         FLOOR,
         WEAK_LAMP,

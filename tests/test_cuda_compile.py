@@ -7,6 +7,7 @@ import dataclasses
 import pytest
 import warp as wp
 
+from wavefront.bsdf.tables import KINDS
 from wavefront.features import Features
 from wavefront.integrator import make_kernels
 
@@ -31,7 +32,7 @@ EVERYTHING = Features(
     spheres=True,
     smooth=True,
     uvs=True,
-    bsdfs=("conductor", "dielectric", "diffuse", "rough_conductor", "rough_dielectric"),
+    bsdfs=tuple(sorted(KINDS)),
     mask=True,
     textures=("bytes", "checkerboard", "floats"),
     lights=("constant", "sphere", "triangle"),

@@ -28,12 +28,17 @@ from wavefront.scene.description import (
     Disk,
     Mask,
     Mesh,
+    Null,
+    OrenNayar,
     PathIntegrator,
     Perspective,
+    Plastic,
     RoughConductor,
     RoughDielectric,
+    RoughPlastic,
     Scene,
     Sphere,
+    ThinDielectric,
     TwoSided,
 )
 
@@ -205,6 +210,7 @@ def material_balls(folder: Path) -> dict[str, Scene]:
     scenes = {
         "diffuse": ("diffuse reflection", Diffuse(reflectance=[0.7, 0.25, 0.12]), None),
         "diffuse-bitmap": ("diffuse reflection from an image", Diffuse(reflectance=tiles), None),
+        "oren-nayar": ("rough diffuse clay", OrenNayar(reflectance=[0.7, 0.25, 0.12], roughness=0.9), None),
         "conductor": ("a smooth metal, gold", Conductor(material="Au"), None),
         "rough-conductor-ggx": ("a rough metal, GGX", RoughConductor(material="Cu", alpha=0.2), None),
         "rough-conductor-beckmann": (
@@ -214,6 +220,14 @@ def material_balls(folder: Path) -> dict[str, Scene]:
         ),
         "dielectric": ("clear glass", Dielectric(int_ior="bk7"), None),
         "rough-dielectric": ("ground glass", RoughDielectric(int_ior="bk7", alpha=0.15), None),
+        "thin-dielectric": ("a soap bubble's wall: a thin sheet of glass", ThinDielectric(int_ior="bk7"), None),
+        "null": ("a ball that is not there; the image shows the stage alone", Null(), None),
+        "plastic": ("a red base below a smooth coating", Plastic(diffuse_reflectance=[0.6, 0.08, 0.05]), None),
+        "rough-plastic": (
+            "an image below a rough coating, with colours that saturate",
+            RoughPlastic(diffuse_reflectance=tiles, alpha=0.15, nonlinear=True),
+            None,
+        ),
         "twosided": (
             "a bowl that is metal outside and diffuse inside",
             TwoSided(front=RoughConductor(material="Au", alpha=0.15), back=Diffuse(reflectance=[0.1, 0.3, 0.6])),

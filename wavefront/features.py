@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 
+from wavefront.bsdf.tables import DELTA
+
 
 @dataclasses.dataclass(frozen=True)
 class Features:
@@ -40,7 +42,7 @@ class Features:
     @property
     def smooth_bsdfs(self) -> bool:
         """Whether a light sample can contribute anywhere."""
-        return any(kind in ("diffuse", "rough_conductor", "rough_dielectric") for kind in self.bsdfs)
+        return any(kind not in DELTA for kind in self.bsdfs)
 
     @property
     def environment(self) -> bool:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from wavefront.bsdf.coating import diffuse_fresnel, rough_coating
 from wavefront.bsdf.conductor import sample_conductor
 from wavefront.bsdf.dielectric import sample_dielectric
 from wavefront.bsdf.diffuse import eval_diffuse, sample_diffuse
@@ -21,9 +22,14 @@ from wavefront.bsdf.microfacet import (
     smith_g1,
     visible_normal_pdf,
 )
+from wavefront.bsdf.null import sample_null
+from wavefront.bsdf.oren_nayar import eval_oren_nayar, sample_oren_nayar
+from wavefront.bsdf.plastic import eval_plastic, sample_plastic
 from wavefront.bsdf.record import BsdfEval, BsdfSample
 from wavefront.bsdf.rough_conductor import eval_rough_conductor, sample_rough_conductor
 from wavefront.bsdf.rough_dielectric import eval_rough_dielectric, sample_rough_dielectric
+from wavefront.bsdf.rough_plastic import eval_rough_plastic, sample_rough_plastic
+from wavefront.bsdf.thin_dielectric import sample_thin_dielectric
 
 DEVICE = "cpu"
 LARGEST_UNIFORM = 1.0 - 2.0**-24
@@ -43,6 +49,10 @@ class Parameters:
     ior: float
     alpha: float
     distribution: int
+    diffuse: wp.vec3
+    internal: float
+    nonlinear: int
+    table: wp.array[wp.float32]
 
 
 @wp.func
@@ -68,6 +78,50 @@ def call_sample_dielectric(p: Parameters, wo: wp.vec3, u: wp.vec3):
 @wp.func
 def call_sample_rough_dielectric(p: Parameters, wo: wp.vec3, u: wp.vec3):
     return sample_rough_dielectric(p.ior, p.reflectance, p.transmittance, p.alpha, p.distribution, wo, u)
+
+
+@wp.func
+def call_sample_thin_dielectric(p: Parameters, wo: wp.vec3, u: wp.vec3):
+    return sample_thin_dielectric(p.ior, p.reflectance, p.transmittance, wo, u)
+
+
+@wp.func
+def call_sample_null(p: Parameters, wo: wp.vec3, u: wp.vec3):
+    return sample_null(wo)
+
+
+@wp.func
+def call_sample_oren_nayar(p: Parameters, wo: wp.vec3, u: wp.vec3):
+    return sample_oren_nayar(p.reflectance, p.alpha, wo, u)
+
+
+@wp.func
+def call_eval_oren_nayar(p: Parameters, wo: wp.vec3, wi: wp.vec3):
+    return eval_oren_nayar(p.reflectance, p.alpha, wo, wi)
+
+
+@wp.func
+def call_sample_plastic(p: Parameters, wo: wp.vec3, u: wp.vec3):
+    return sample_plastic(p.diffuse, p.reflectance, p.ior, p.internal, p.nonlinear, wo, u)
+
+
+@wp.func
+def call_sample_rough_plastic(p: Parameters, wo: wp.vec3, u: wp.vec3):
+    return sample_rough_plastic(
+        p.diffuse, p.reflectance, p.ior, p.internal, p.nonlinear, p.alpha, p.distribution, p.table, 0, wo, u
+    )
+
+
+@wp.func
+def call_eval_plastic(p: Parameters, wo: wp.vec3, wi: wp.vec3):
+    return eval_plastic(p.diffuse, p.reflectance, p.ior, p.internal, p.nonlinear, wo, wi)
+
+
+@wp.func
+def call_eval_rough_plastic(p: Parameters, wo: wp.vec3, wi: wp.vec3):
+    return eval_rough_plastic(
+        p.diffuse, p.reflectance, p.ior, p.internal, p.nonlinear, p.alpha, p.distribution, p.table, 0, wo, wi
+    )
 
 
 @wp.func
@@ -121,11 +175,19 @@ _SAMPLE_KERNELS = {
     "rough_conductor": _sample_kernel(call_sample_rough_conductor),
     "dielectric": _sample_kernel(call_sample_dielectric),
     "rough_dielectric": _sample_kernel(call_sample_rough_dielectric),
+    "thin_dielectric": _sample_kernel(call_sample_thin_dielectric),
+    "null": _sample_kernel(call_sample_null),
+    "oren_nayar": _sample_kernel(call_sample_oren_nayar),
+    "plastic": _sample_kernel(call_sample_plastic),
+    "rough_plastic": _sample_kernel(call_sample_rough_plastic),
 }
 _EVAL_KERNELS = {
     "diffuse": _eval_kernel(call_eval_diffuse),
     "rough_conductor": _eval_kernel(call_eval_rough_conductor),
     "rough_dielectric": _eval_kernel(call_eval_rough_dielectric),
+    "oren_nayar": _eval_kernel(call_eval_oren_nayar),
+    "plastic": _eval_kernel(call_eval_plastic),
+    "rough_plastic": _eval_kernel(call_eval_rough_plastic),
 }
 
 
@@ -197,6 +259,9 @@ def parameters(
     ior=1.5,
     alpha=0.1,
     distribution=0,
+    diffuse=(1.0, 1.0, 1.0),
+    nonlinear=False,
+    coating="smooth",
 ) -> Parameters:
     """White by default: a perfect mirror, or a boundary that absorbs nothing."""
     p = Parameters()
@@ -207,6 +272,14 @@ def parameters(
     p.ior = float(ior)
     p.alpha = float(alpha)
     p.distribution = int(distribution)
+    p.diffuse = wp.vec3(*diffuse)
+    p.nonlinear = int(nonlinear)
+    p.internal = diffuse_fresnel(1.0 / float(ior))
+    if coating == "rough":
+        table, p.internal = rough_coating(float(ior), float(alpha), int(distribution))
+        p.table = wp.array(table, dtype=wp.float32, device=DEVICE)
+    else:
+        p.table = wp.zeros(1, dtype=wp.float32, device=DEVICE)
     return p
 
 

@@ -122,11 +122,11 @@ def test_reflectors_are_one_sided():
     wi = harness.random_directions(2000, 4)
     below = (w[:, 2] <= 0.0) | (wi[:, 2] <= 0.0)
     u = harness.uniforms(2000, 5)
-    for name in ("diffuse", "rough_conductor"):
+    for name in ("diffuse", "rough_conductor", "plastic", "oren_nayar"):
         e = harness.evaluate(name, harness.parameters(alpha=0.5), w, wi)
         assert np.all((e.value[:, 0] == 0.0) == below)
         assert np.all((e.pdf == 0.0) == below)
-    for name in ("diffuse", "conductor", "rough_conductor"):
+    for name in ("diffuse", "conductor", "rough_conductor", "plastic", "oren_nayar"):
         s = harness.sample(name, harness.parameters(alpha=0.5), w, u)
         assert np.all(s.weight[w[:, 2] <= 0.0] == 0.0)
         assert np.all(s.wi[s.weight[:, 0] > 0.0, 2] > 0.0)

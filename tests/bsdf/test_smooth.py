@@ -57,6 +57,38 @@ def test_dielectric(ior):
         np.testing.assert_array_equal(s.pdf, 0.0)
 
 
+@pytest.mark.parametrize("ior", [1.0001, 1.5, 4.0, 0.5])
+def test_thin_dielectric(ior):
+    """The share of reflection is the sum over reflections inside the sheet, the same from both sides; a pass is
+    straight on. Each sample carries all of the flux."""
+    ior = float(np.float32(ior))
+    for seed, cos_o in enumerate([1.0, 0.5, 0.05, -0.05, -0.5, -1.0]):
+        wo = harness.direction(cos_o)
+        p = harness.parameters((0.9, 0.5, 0.0), (0.3, 0.6, 1.0), ior=ior)
+        s = harness.sample("thin_dielectric", p, wo, harness.uniforms(N, seed))
+        f = oracle.fresnel(np.array([cos_o]), ior)[0]
+        # F, then into the sheet, once or three, five, ... times reflected inside, and out again
+        expected = f + (1.0 - f) ** 2 * sum(f ** (2 * k + 1) for k in range(4000))
+        reflected = s.wi[:, 2] * cos_o > 0.0
+        sigma = np.sqrt(expected * (1.0 - expected) / N)
+        assert abs(reflected.mean() - expected) <= 5.0 * sigma + 1e-6  # false-alarm rate 6e-7 each
+        mirror = np.where(reflected[:, None], wo * [-1.0, -1.0, 1.0], -wo)
+        np.testing.assert_allclose(s.wi, mirror, atol=1e-7)
+        tint = np.where(reflected[:, None], (0.9, 0.5, 0.0), (0.3, 0.6, 1.0))
+        np.testing.assert_allclose(s.weight, tint, rtol=1e-6)
+        np.testing.assert_array_equal(s.pdf, 0.0)
+        np.testing.assert_array_equal(s.eta, 1.0)
+
+
+def test_null_lets_everything_pass():
+    wo = harness.random_directions(100, 1)
+    s = harness.sample("null", harness.parameters(), wo, harness.uniforms(100, 2))
+    np.testing.assert_array_equal(s.wi, -wo)
+    np.testing.assert_array_equal(s.weight, 1.0)
+    np.testing.assert_array_equal(s.pdf, 0.0)
+    np.testing.assert_array_equal(s.eta, 1.0)
+
+
 def test_total_reflection_is_certain():
     """Even with the largest random number."""
     u = np.full((3, 3), harness.LARGEST_UNIFORM, dtype=np.float32)
@@ -108,10 +140,15 @@ def test_vanishing_roughness_is_smooth(distribution):
 
 
 ENDS = [0.0, 2.0**-24, 0.3, 0.5, 1.0 - 2.0**-23, harness.LARGEST_UNIFORM]
+ALL_KINDS = [
+    "diffuse", "conductor", "rough_conductor", "dielectric", "rough_dielectric", "plastic", "rough_plastic",
+    "thin_dielectric", "null", "oren_nayar",
+]  # fmt: skip
+DENSE = ["diffuse", "rough_conductor", "rough_dielectric", "plastic", "rough_plastic", "oren_nayar"]
 COSINES = [1.0, 1.0 - 2.0**-24, 0.5, 1e-2, 1e-4, 1e-7, 1e-20, 1e-30, 0.0]
 
 
-@pytest.mark.parametrize("name", ["diffuse", "conductor", "rough_conductor", "dielectric", "rough_dielectric"])
+@pytest.mark.parametrize("name", ALL_KINDS)
 def test_extremes_are_finite(name):
     """Every end of every range: samples and values are finite and not negative, directions are unit vectors."""
     u = np.array(list(itertools.product(ENDS, repeat=3)), dtype=np.float32)
@@ -119,15 +156,22 @@ def test_extremes_are_finite(name):
     wo_all = np.repeat(wo, len(u), axis=0)
     u_all = np.tile(u, (len(wo), 1))
     for alpha, distribution, ior in itertools.product((1e-4, 0.01, 1.0), (0, 1), (1.0, 1.0001, 1.5, 4.0, 0.25)):
-        p = harness.parameters(alpha=alpha, distribution=distribution, ior=ior, eta=(0.2, 0.0, 4.0), k=(3.9, 0.0, 0.0))
+        p = harness.parameters(
+            alpha=alpha, distribution=distribution, ior=ior, eta=(0.2, 0.0, 4.0), k=(3.9, 0.0, 0.0),
+            diffuse=(0.8, 0.0, 1.0), coating="rough" if name == "rough_plastic" else "smooth",
+        )  # fmt: skip
         s = harness.sample(name, p, wo_all, u_all)
         for field in (s.wi, s.weight, s.pdf, s.eta):
             assert np.all(np.isfinite(field))
         assert np.all(s.pdf >= 0.0)
         assert np.all(s.weight >= 0.0)
-        assert np.all(s.weight * s.eta[:, None] ** 2 <= 1.0 + 1e-5)
+        bound = 3.2 if name == "oren_nayar" else 1.0
+        if "plastic" in name:
+            # The part is chosen by the mean of the channels, and the base returns up to 1 / (1 - internal).
+            bound = 3.0 * max(1.0, 1.0 / ((1.0 - p.internal) * ior**2))
+        assert np.all(s.weight * s.eta[:, None] ** 2 <= bound + 1e-5)
         np.testing.assert_allclose(np.linalg.norm(s.wi, axis=1), 1.0, atol=1e-5)
-        if name in ("diffuse", "rough_conductor", "rough_dielectric"):
+        if name in DENSE:
             for wi in (s.wi, -wo_all, wo_all, wo_all * [-1.0, -1.0, 1.0]):
                 e = harness.evaluate(name, p, wo_all, wi)
                 assert np.all(np.isfinite(e.value))

@@ -16,7 +16,10 @@ from wavefront.scene import json_format, load_scene
 
 SPHERE = {"type": "sphere"}
 NAME_OR_BITMAP = "a list of 3 numbers >= 0 and <= 1, a name or an object of type 'bitmap' or 'checkerboard'"
-BSDF_TYPES = "'diffuse', 'conductor', 'rough_conductor', 'dielectric', 'rough_dielectric', 'twosided'"
+BSDF_TYPES = (
+    "'diffuse', 'oren_nayar', 'conductor', 'rough_conductor', 'dielectric', 'rough_dielectric', 'thin_dielectric', "
+    "'plastic', 'rough_plastic', 'null', 'twosided'"
+)
 
 
 def sphere(**fields):

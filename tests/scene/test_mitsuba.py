@@ -225,13 +225,33 @@ BSDFS = [
     ),
     ('<bsdf type="roughdielectric"/>', d.RoughDielectric(distribution="beckmann")),
     ('<bsdf type="roughdielectric"><float name="alpha" value="0"/></bsdf>', d.Dielectric()),
+    ('<bsdf type="plastic"/>', d.Plastic()),
+    (
+        '<bsdf type="plastic"><float name="int_ior" value="1.6"/><string name="ext_ior" value="water"/>'
+        '<rgb name="diffuse_reflectance" value="0.1 0.2 0.3"/><float name="specular_reflectance" value="0.75"/>'
+        '<boolean name="nonlinear" value="true"/></bsdf>',
+        d.Plastic(
+            int_ior=1.6,
+            ext_ior="water",
+            diffuse_reflectance=[0.1, 0.2, 0.3],
+            specular_reflectance=0.75,
+            nonlinear=True,
+        ),
+    ),
+    ('<bsdf type="roughplastic"/>', d.RoughPlastic(distribution="beckmann")),
+    (
+        '<bsdf type="roughplastic"><float name="alpha" value="0.3"/><string name="distribution" value="ggx"/>'
+        '<boolean name="nonlinear" value="true"/></bsdf>',
+        d.RoughPlastic(alpha=0.3, nonlinear=True),
+    ),
     ('<bsdf type="twosided"><bsdf type="diffuse"/></bsdf>', d.TwoSided(front=d.Diffuse())),
     (
         '<bsdf type="twosided"><bsdf type="diffuse"/><bsdf type="conductor"/></bsdf>',
         d.TwoSided(front=d.Diffuse(), back=d.Conductor(eta=0.0, k=1.0)),
     ),
     ('<bsdf type="mask"><bsdf type="diffuse"/></bsdf>', d.Mask(bsdf=d.Diffuse(), opacity=0.5)),
-    ('<bsdf type="null"/>', d.Mask(bsdf=d.Diffuse(reflectance=0.0), opacity=0.0)),
+    ('<bsdf type="null"/>', d.Null()),
+    ('<bsdf type="thindielectric"><float name="int_ior" value="1.5"/></bsdf>', d.ThinDielectric(int_ior=1.5)),
 ]
 
 
@@ -246,9 +266,11 @@ def test_mitsuba_reads_the_same_bsdfs(mi, body, expected):
 
 
 def test_default_indices_are_those_of_mitsuba(mi):
-    record = d.Dielectric()
-    eta = mi.traverse(mi.load_dict({"type": "dielectric"}))["eta"]
-    assert record.int_ior / record.ext_ior == pytest.approx(eta, rel=1e-6)
+    for record in (d.Dielectric(), d.RoughDielectric(), d.Plastic(), d.RoughPlastic()):
+        kind = record.__struct_config__.tag.replace("_", "")
+        eta = mi.traverse(mi.load_dict({"type": kind}))["eta"]
+        assert record.int_ior / record.ext_ior == pytest.approx(eta, rel=1e-6)
+    assert (d.ThinDielectric().int_ior, d.ThinDielectric().ext_ior) == (d.Dielectric().int_ior, d.Dielectric().ext_ior)
 
 
 @pytest.mark.parametrize(
@@ -434,8 +456,18 @@ def test_named_textures(load_xml):
     assert [texture.name for texture in scene.textures] == ["t"]
 
 
+@pytest.mark.parametrize(("alpha", "roughness"), [(0.0, 0.0), (0.2, 0.0842246), (1.0, 0.5457335)])
+def test_rough_diffuse_of_mitsuba_0(load_xml, alpha, roughness):
+    """The ratio of the terms of Oren and Nayar's qualitative model at sigma = alpha / sqrt(2)."""
+    body = f'<bsdf type="roughdiffuse"><float name="alpha" value="{alpha}"/>'
+    body += '<boolean name="useFastApprox" value="true"/>'
+    found = bsdf_of(load_xml(on_shape(body + '<rgb name="reflectance" value="0.1 0.2 0.3"/></bsdf>'), "0.6.0"))
+    assert found.reflectance == [0.1, 0.2, 0.3]
+    assert found.roughness == pytest.approx(roughness, rel=1e-5, abs=1e-9)
+
+
 def test_unused_unsupported_bsdf_is_a_warning(load_xml):
-    scene = load_xml('<bsdf type="plastic" id="p"/>' + on_shape(""))
+    scene = load_xml('<bsdf type="pplastic" id="p"/>' + on_shape(""))
     assert scene.bsdfs == []
     assert any("line 2: bsdf 'p' is left out" in warning for warning in load_xml.warnings)
 

@@ -31,7 +31,12 @@ def path(body):
 ERRORS = [
     ('\n\n<shape type="cylinder"/>', 4, "shape 'cylinder' is not supported; supported: obj, ply, rectangle"),
     ('<shape type="serialized"/>', 2, "shape 'serialized' is not supported"),
-    (on_shape('\n<bsdf type="plastic"/>'), 3, "bsdf 'plastic' is not supported; supported: diffuse"),
+    (on_shape('\n<bsdf type="plaster"/>'), 3, "bsdf 'plaster' is not supported; supported: diffuse"),
+    (bsdf("plastic", '<float name="alpha" value="0.1"/>'), 2, "alpha"),
+    (bsdf("roughplastic", '<float name="alpha_u" value="0.2"/>'), 2, "needs one number alpha"),
+    (bsdf("roughplastic", '<texture name="alpha" type="checkerboard"/>'), 2, "needs one number alpha"),
+    (bsdf("plastic", '<rgb name="diffuse_reflectance" value="1 2 1"/>'), 2, "must be from 0 to 1"),
+    (bsdf("roughdiffuse", '<texture name="alpha" type="checkerboard"/>'), 2, "needs a number alpha"),
     (bsdf("bumpmap"), 2, "bsdf 'bumpmap' is not supported yet"),
     ('<emitter type="point"/>', 2, "emitter 'point' is not supported; supported: area, constant"),
     ('<emitter type="area"/>', 2, "belongs inside a shape"),

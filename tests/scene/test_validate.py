@@ -14,7 +14,7 @@ from wavefront.scene.validate import MESH_SUFFIXES, validate
 
 STEP = d.TransformStep
 STEPS = "translate, rotate, scale, look_at, matrix"
-REFLECTING = "diffuse, conductor, rough_conductor"
+REFLECTING = "diffuse, oren_nayar, conductor, rough_conductor, plastic, rough_plastic"
 TOO_LARGE = "expected a number of at most 3.403e+38, as 32-bit floats are; found"
 
 
@@ -61,6 +61,10 @@ def moved(*transform, shape=d.Rectangle):
         (
             with_bsdfs(d.TwoSided(front=d.Dielectric())),
             f"bsdfs[0].front: a twosided BSDF cannot hold dielectric; allowed: {REFLECTING}",
+        ),
+        (
+            with_bsdfs(d.TwoSided(front=d.ThinDielectric())),
+            f"bsdfs[0].front: a twosided BSDF cannot hold thin_dielectric; allowed: {REFLECTING}",
         ),
         (
             with_bsdfs(d.TwoSided(front=d.Diffuse(), back="m"), d.Mask(name="m", bsdf=d.Diffuse())),
@@ -191,6 +195,17 @@ def test_a_scene_that_makes_no_sense_is_refused_with_the_place(scene, message):
     assert str(caught.value) == f"s.json: {message}"
 
 
+def test_unknown_indices_of_refraction_are_refused():
+    for bsdf in (d.ThinDielectric(int_ior="plastik"), d.Plastic(int_ior="plastik"), d.RoughPlastic(ext_ior="plastik")):
+        with pytest.raises(SceneError, match="unknown index of refraction 'plastik'"):
+            validate(with_bsdfs(bsdf))
+
+
+def test_the_name_of_a_texture_of_roughness_is_checked():
+    with pytest.raises(SceneError, match="bsdfs\\[0\\].roughness: unknown texture 'clay'"):
+        validate(with_bsdfs(d.OrenNayar(roughness="clay")))
+
+
 def test_unknown_metals_are_named_with_the_nearest():
     with pytest.raises(SceneError) as caught:
         validate(with_bsdfs(d.Conductor(material="TiO")))
@@ -223,6 +238,10 @@ def test_a_rotation_without_an_axis_is_refused():
     "scene",
     [
         with_bsdfs(d.Mask(name="m", bsdf="t"), d.TwoSided(name="t", front="d", back=d.Conductor(material="none"))),
+        with_bsdfs(d.TwoSided(front=d.OrenNayar(roughness=d.Checkerboard(color0=0.0, color1=1.0)))),
+        with_bsdfs(
+            d.TwoSided(front=d.Plastic(int_ior="water"), back=d.RoughPlastic(diffuse_reflectance=[1.0, 0.0, 0.5]))
+        ),
         with_bsdfs(d.Mask(bsdf=d.RoughDielectric()), d.Mask(bsdf=d.TwoSided(front=d.Diffuse()))),
         moved(STEP(scale=1e-6), STEP(scale=(1.0, 1e6, 1.0))),
         moved(STEP(scale=-3.0), STEP(rotate=d.Rotate(axis=(1.0, 2.0, 3.0), angle=77.0)), shape=d.Sphere),

@@ -115,6 +115,22 @@ class _Writer:
             return {"type": "mask", "opacity": opacity, "nested": self._bsdf(bsdf.bsdf)}
         if isinstance(bsdf, description.Diffuse):
             return {"type": "diffuse", "reflectance": self._parameter(bsdf.reflectance)}
+        if isinstance(bsdf, (description.Plastic, description.RoughPlastic)):
+            result = {
+                "type": "plastic",
+                "int_ior": bsdf.int_ior,
+                "ext_ior": bsdf.ext_ior,
+                "nonlinear": bsdf.nonlinear,
+                "diffuse_reflectance": self._parameter(bsdf.diffuse_reflectance),
+                "specular_reflectance": self._parameter(bsdf.specular_reflectance),
+            }
+            if isinstance(bsdf, description.RoughPlastic):
+                result |= {"type": "roughplastic", "distribution": bsdf.distribution, "alpha": bsdf.alpha}
+            return result
+        if isinstance(bsdf, description.OrenNayar):
+            raise WavefrontError("Mitsuba 3 has no oren_nayar BSDF")
+        if isinstance(bsdf, description.Null):
+            return {"type": "null"}
         rough = isinstance(bsdf, (description.RoughConductor, description.RoughDielectric))
         result = {"specular_reflectance": self._parameter(bsdf.specular_reflectance)}
         if rough:
@@ -125,8 +141,9 @@ class _Writer:
                 return result | {"material": bsdf.material}
             eta, k = (0.0, 1.0) if bsdf.eta is None else (bsdf.eta, bsdf.k)  # a perfect mirror
             return result | {"eta": self._parameter(eta), "k": self._parameter(k)}
+        thin = isinstance(bsdf, description.ThinDielectric)
         return result | {
-            "type": "roughdielectric" if rough else "dielectric",
+            "type": "thindielectric" if thin else "roughdielectric" if rough else "dielectric",
             "int_ior": bsdf.int_ior,
             "ext_ior": bsdf.ext_ior,
             "specular_transmittance": self._parameter(bsdf.specular_transmittance),

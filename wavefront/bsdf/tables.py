@@ -14,9 +14,25 @@ KIND_CONDUCTOR = wp.constant(2)
 KIND_ROUGH_CONDUCTOR = wp.constant(3)
 KIND_DIELECTRIC = wp.constant(4)
 KIND_ROUGH_DIELECTRIC = wp.constant(5)
-KINDS = {"diffuse": 1, "conductor": 2, "rough_conductor": 3, "dielectric": 4, "rough_dielectric": 5}
-TRANSMISSIVE = ("dielectric", "rough_dielectric")
-DELTA = ("conductor", "dielectric")
+KIND_PLASTIC = wp.constant(6)
+KIND_ROUGH_PLASTIC = wp.constant(7)
+KIND_THIN_DIELECTRIC = wp.constant(8)
+KIND_NULL = wp.constant(9)
+KIND_OREN_NAYAR = wp.constant(10)
+KINDS = {
+    "diffuse": 1,
+    "conductor": 2,
+    "rough_conductor": 3,
+    "dielectric": 4,
+    "rough_dielectric": 5,
+    "plastic": 6,
+    "rough_plastic": 7,
+    "thin_dielectric": 8,
+    "null": 9,
+    "oren_nayar": 10,
+}
+TRANSMISSIVE = ("dielectric", "rough_dielectric", "thin_dielectric", "null")
+DELTA = ("conductor", "dielectric", "thin_dielectric", "null")
 
 
 @wp.struct
@@ -36,6 +52,14 @@ class DiffuseRecord:
 
 
 @wp.struct
+class OrenNayarRecord:
+    reflectance: wp.vec3
+    reflectance_texture: wp.int32
+    roughness: wp.float32
+    roughness_texture: wp.int32
+
+
+@wp.struct
 class ConductorRecord:
     """Smooth and rough; `alpha` and `distribution` are read for rough conductors only."""
 
@@ -52,7 +76,7 @@ class ConductorRecord:
 
 @wp.struct
 class DielectricRecord:
-    """Smooth and rough; `alpha` and `distribution` are read for rough dielectrics only."""
+    """Smooth, rough and thin; `alpha` and `distribution` are read for rough dielectrics only."""
 
     eta: wp.float32  # interior over exterior index of refraction
     reflectance: wp.vec3
@@ -65,8 +89,27 @@ class DielectricRecord:
 
 
 @wp.struct
+class PlasticRecord:
+    """Smooth and rough; `alpha`, `distribution` and `first` are read for rough plastics only."""
+
+    eta: wp.float32  # interior over exterior index of refraction
+    internal_reflectance: wp.float32  # of the coating, for diffuse light from inside
+    nonlinear: wp.int32
+    diffuse: wp.vec3
+    diffuse_texture: wp.int32
+    reflectance: wp.vec3
+    reflectance_texture: wp.int32
+    alpha: wp.float32
+    distribution: wp.int32
+    first: wp.int32  # index into MaterialTables.coatings of the coating's transmittance
+
+
+@wp.struct
 class MaterialTables:
     materials: wp.array[Material]
     diffuse: wp.array[DiffuseRecord]
     conductor: wp.array[ConductorRecord]
     dielectric: wp.array[DielectricRecord]
+    plastic: wp.array[PlasticRecord]
+    oren_nayar: wp.array[OrenNayarRecord]
+    coatings: wp.array[wp.float32]

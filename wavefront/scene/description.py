@@ -113,6 +113,14 @@ class Diffuse(Record, tag_field="type", tag="diffuse"):
     reflectance: Reflectance = 0.5
 
 
+class OrenNayar(Record, tag_field="type", tag="oren_nayar"):
+    """Rough diffuse reflection (Oren and Nayar 1994 in Fujii's improved form), one-sided."""
+
+    name: str = ""
+    reflectance: Reflectance = 0.5
+    roughness: Annotated[Opacity, Meta(description="0: Lambertian; 1: as rough as the model goes.")] = 0.5
+
+
 class Conductor(Record, tag_field="type", tag="conductor"):
     """Smooth conductor with a complex index of refraction."""
 
@@ -164,6 +172,52 @@ class RoughDielectric(Record, tag_field="type", tag="rough_dielectric"):
     distribution: Distribution = "ggx"
 
 
+class Plastic(Record, tag_field="type", tag="plastic"):
+    """A diffuse base below a smooth dielectric coating, one-sided."""
+
+    name: str = ""
+    int_ior: Annotated[IOR, Meta(description="Index of refraction of the coating, or a name.")] = 1.49
+    ext_ior: Annotated[IOR, Meta(description="Exterior index of refraction, or a name.")] = 1.000277
+    diffuse_reflectance: Reflectance = 0.5
+    specular_reflectance: Reflectance = 1.0
+    nonlinear: Annotated[bool, Meta(description="Let colours saturate by light that bounces below the coating.")] = (
+        False
+    )
+
+
+class RoughPlastic(Record, tag_field="type", tag="rough_plastic"):
+    """A diffuse base below a dielectric coating with a microfacet surface, one-sided."""
+
+    name: str = ""
+    int_ior: Annotated[IOR, Meta(description="Index of refraction of the coating, or a name.")] = 1.49
+    ext_ior: Annotated[IOR, Meta(description="Exterior index of refraction, or a name.")] = 1.000277
+    diffuse_reflectance: Reflectance = 0.5
+    specular_reflectance: Reflectance = 1.0
+    nonlinear: Annotated[bool, Meta(description="Let colours saturate by light that bounces below the coating.")] = (
+        False
+    )
+    alpha: Annotated[
+        float, Meta(ge=1e-4, le=1.0, description="Microfacet roughness (root mean square slope for Beckmann).")
+    ] = 0.1
+    distribution: Distribution = "ggx"
+
+
+class ThinDielectric(Record, tag_field="type", tag="thin_dielectric"):
+    """A thin sheet of glass, modelled by one surface: reflects and lets pass without refraction, both sides alike."""
+
+    name: str = ""
+    int_ior: Annotated[IOR, Meta(description="Index of refraction of the sheet, or a name.")] = 1.5046
+    ext_ior: Annotated[IOR, Meta(description="Exterior index of refraction, or a name.")] = 1.000277
+    specular_reflectance: Reflectance = 1.0
+    specular_transmittance: Reflectance = 1.0
+
+
+class Null(Record, tag_field="type", tag="null"):
+    """A surface that is not there: light passes. It can still emit."""
+
+    name: str = ""
+
+
 class TwoSided(Record, tag_field="type", tag="twosided"):
     """A reflecting BSDF on both sides of a surface; `back` defaults to `front`."""
 
@@ -180,7 +234,20 @@ class Mask(Record, tag_field="type", tag="mask"):
     opacity: Opacity = 0.5
 
 
-Bsdf = Diffuse | Conductor | RoughConductor | Dielectric | RoughDielectric | TwoSided | Mask
+Bsdf = (
+    Diffuse
+    | OrenNayar
+    | Conductor
+    | RoughConductor
+    | Dielectric
+    | RoughDielectric
+    | ThinDielectric
+    | Plastic
+    | RoughPlastic
+    | Null
+    | TwoSided
+    | Mask
+)
 
 # --- emitters --------------------------------------------------------------------------------------------------
 

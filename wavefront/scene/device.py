@@ -9,6 +9,7 @@ import warp as wp
 
 from wavefront.accel.mesh_query import Geometry, Shape
 from wavefront.bsdf import tables as bsdf_tables
+from wavefront.bsdf.coating import diffuse_fresnel, rough_coating
 from wavefront.errors import SceneError
 from wavefront.film import LUMINANCE
 from wavefront.light import tables as light_tables
@@ -23,10 +24,15 @@ from wavefront.texture import WRAP_MODES, TextureRecord, TextureTables, srgb_to_
 DISTRIBUTIONS = {"ggx": 0, "beckmann": 1}
 BSDF_KINDS = {
     description.Diffuse: "diffuse",
+    description.OrenNayar: "oren_nayar",
     description.Conductor: "conductor",
     description.RoughConductor: "rough_conductor",
     description.Dielectric: "dielectric",
     description.RoughDielectric: "rough_dielectric",
+    description.ThinDielectric: "thin_dielectric",
+    description.Null: "null",
+    description.Plastic: "plastic",
+    description.RoughPlastic: "rough_plastic",
 }
 
 
@@ -145,12 +151,26 @@ def _rgb(value) -> np.ndarray:
     return np.broadcast_to(np.asarray(value, np.float64), 3)
 
 
+def _relative_ior(bsdf) -> float:
+    interior, exterior = (
+        INDEX_OF_REFRACTION[value] if isinstance(value, str) else value for value in (bsdf.int_ior, bsdf.ext_ior)
+    )
+    return interior / exterior
+
+
 class _Upload:
     def __init__(self, scene: description.Scene, device: str):
         self.scene, self.device = scene, device
         self.atlas = _TextureAtlas()
         self.materials: list[dict] = []
-        self.bsdfs: dict[str, list[dict]] = {"diffuse": [], "conductor": [], "dielectric": []}
+        self.bsdfs: dict[str, list[dict]] = {
+            "diffuse": [],
+            "conductor": [],
+            "dielectric": [],
+            "plastic": [],
+            "oren_nayar": [],
+        }
+        self.coatings: list[np.ndarray] = []
         self.bsdf_kinds: set[str] = set()
         self.known_materials: dict[int, int] = {}
         self.mask = False
@@ -169,6 +189,10 @@ class _Upload:
         materials.diffuse = _struct_array(bsdf_tables.DiffuseRecord, self.bsdfs["diffuse"], self.device)
         materials.conductor = _struct_array(bsdf_tables.ConductorRecord, self.bsdfs["conductor"], self.device)
         materials.dielectric = _struct_array(bsdf_tables.DielectricRecord, self.bsdfs["dielectric"], self.device)
+        materials.plastic = _struct_array(bsdf_tables.PlasticRecord, self.bsdfs["plastic"], self.device)
+        materials.oren_nayar = _struct_array(bsdf_tables.OrenNayarRecord, self.bsdfs["oren_nayar"], self.device)
+        coatings = np.concatenate([np.zeros(0), *self.coatings])
+        materials.coatings = wp.array(coatings, dtype=wp.float32, device=self.device)
         return DeviceScene(
             geometry=geometry,
             materials=materials,
@@ -228,10 +252,17 @@ class _Upload:
     def _bsdf(self, bsdf: description.Bsdf, where: str) -> tuple[int, int]:
         """Kind and record index of a BSDF that is neither two-sided nor a mask."""
         kind = BSDF_KINDS[type(bsdf)]
+        self.bsdf_kinds.add(kind)
+        if kind == "null":
+            return bsdf_tables.KINDS[kind], 0  # has no parameters, hence no record
         record: dict = {}
         if kind == "diffuse":
             table = "diffuse"
             self._set(record, "reflectance", bsdf.reflectance, f"{where}.reflectance")
+        elif kind == "oren_nayar":
+            table = "oren_nayar"
+            self._set(record, "reflectance", bsdf.reflectance, f"{where}.reflectance")
+            self._set(record, "roughness", bsdf.roughness, f"{where}.roughness", scalar=True)
         elif kind in ("conductor", "rough_conductor"):
             table = "conductor"
             eta, k = CONDUCTORS[bsdf.material] if bsdf.material is not None else (bsdf.eta, bsdf.k)
@@ -239,19 +270,29 @@ class _Upload:
             self._set(record, "eta", eta, f"{where}.eta")
             self._set(record, "k", k, f"{where}.k")
             self._set(record, "reflectance", bsdf.specular_reflectance, f"{where}.specular_reflectance")
+        elif kind in ("plastic", "rough_plastic"):
+            table = "plastic"
+            record["eta"] = _relative_ior(bsdf)
+            record["nonlinear"] = int(bsdf.nonlinear)
+            self._set(record, "diffuse", bsdf.diffuse_reflectance, f"{where}.diffuse_reflectance")
+            self._set(record, "reflectance", bsdf.specular_reflectance, f"{where}.specular_reflectance")
+            if kind == "plastic":
+                record["internal_reflectance"] = diffuse_fresnel(1.0 / record["eta"])
+            else:
+                record["alpha"], record["distribution"] = bsdf.alpha, DISTRIBUTIONS[bsdf.distribution]
+                transmittance, record["internal_reflectance"] = rough_coating(
+                    record["eta"], bsdf.alpha, record["distribution"]
+                )
+                record["first"] = sum(part.size for part in self.coatings)
+                self.coatings.append(transmittance)
         else:
             table = "dielectric"
-            interior, exterior = (
-                INDEX_OF_REFRACTION[value] if isinstance(value, str) else value
-                for value in (bsdf.int_ior, bsdf.ext_ior)
-            )
-            record["eta"] = interior / exterior
+            record["eta"] = _relative_ior(bsdf)
             self._set(record, "reflectance", bsdf.specular_reflectance, f"{where}.specular_reflectance")
             self._set(record, "transmittance", bsdf.specular_transmittance, f"{where}.specular_transmittance")
-        if kind.startswith("rough_"):
+        if kind in ("rough_conductor", "rough_dielectric"):
             self._set(record, "alpha", bsdf.alpha, f"{where}.alpha", scalar=True)
             record["distribution"] = DISTRIBUTIONS[bsdf.distribution]
-        self.bsdf_kinds.add(kind)
         self.bsdfs[table].append(record)
         return bsdf_tables.KINDS[kind], len(self.bsdfs[table]) - 1
 

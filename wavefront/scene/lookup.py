@@ -10,7 +10,18 @@ from wavefront.scene import description
 
 # Fields in which a string is the name of a texture.
 TEXTURE_FIELDS = frozenset(
-    ("reflectance", "specular_reflectance", "specular_transmittance", "alpha", "opacity", "radiance", "eta", "k")
+    (
+        "reflectance",
+        "diffuse_reflectance",
+        "specular_reflectance",
+        "specular_transmittance",
+        "alpha",
+        "roughness",
+        "opacity",
+        "radiance",
+        "eta",
+        "k",
+    )
 )
 # Fields in which a string is the name of a BSDF.
 BSDF_FIELDS = frozenset(("bsdf", "front", "back"))

@@ -37,10 +37,14 @@ class Materials:
         self.named = {plugin.id: plugin for plugin in top if plugin.id and plugin.tag in ("bsdf", "texture")}
         self._bsdfs = {
             "diffuse": self._diffuse,
+            "roughdiffuse": self._rough_diffuse,
             "conductor": self._conductor,
             "roughconductor": self._conductor,
             "dielectric": self._dielectric,
             "roughdielectric": self._dielectric,
+            "thindielectric": self._dielectric,
+            "plastic": self._plastic,
+            "roughplastic": self._plastic,
             "twosided": self._twosided,
             "mask": self._mask,
             "null": self._null,
@@ -90,6 +94,23 @@ class Materials:
         plugin.finish("texture")
         return record
 
+    def _rough_diffuse(self, plugin):
+        """Of Mitsuba 0.x; its alpha is a slope, of which Oren and Nayar's sigma is alpha / sqrt(2).
+
+        The roughness is the one that gives the model's two terms, A + B ..., the same ratio (Oren and Nayar 1994,
+        section 4.2, without interreflection).
+        """
+        reflectance = self.colour(plugin, "reflectance", 0.5, limit=1.0)
+        alpha = self.scalar(plugin, "alpha", 0.2)
+        plugin.ignore("use_fast_approx")
+        plugin.finish("texture")
+        if not isinstance(alpha, float):
+            raise plugin.error(f"{plugin.label()} needs a number alpha; a texture is not supported")
+        variance = 0.5 * alpha * alpha
+        a = 1.0 - 0.5 * variance / (variance + 0.33)
+        b = 0.45 * variance / (variance + 0.09)
+        return description.OrenNayar(reflectance=reflectance, roughness=b / a)
+
     def _conductor(self, plugin):
         fields = self._conductor_spectrum(plugin)
         fields["specular_reflectance"] = self.colour(plugin, "specular_reflectance", 1.0, limit=1.0)
@@ -132,7 +153,24 @@ class Materials:
         plugin.finish("texture")
         if "alpha" in fields and _is_smooth(fields["alpha"]):
             del fields["alpha"], fields["distribution"]
+        if plugin.type == "thindielectric":
+            return description.ThinDielectric(**fields)
         return (description.RoughDielectric if "alpha" in fields else description.Dielectric)(**fields)
+
+    def _plastic(self, plugin):
+        fields = {"nonlinear": plugin.boolean("nonlinear")}
+        for name, default in (("int_ior", 1.49), ("ext_ior", 1.000277)):
+            fields[name] = self._ior(plugin, name, default)
+        for name, default in (("diffuse_reflectance", 0.5), ("specular_reflectance", 1.0)):
+            fields[name] = self.colour(plugin, name, default, limit=1.0)
+        if plugin.type == "roughplastic":
+            if plugin.has("alpha_u") or plugin.has("alpha_v") or plugin.child("alpha") is not None:
+                raise plugin.error(f"{plugin.label()} needs one number alpha for both directions")
+            fields |= self._roughness(plugin)
+        plugin.finish("texture")
+        if "alpha" in fields and _is_smooth(fields["alpha"]):
+            del fields["alpha"], fields["distribution"]
+        return (description.RoughPlastic if "alpha" in fields else description.Plastic)(**fields)
 
     def _ior(self, plugin, name, default):
         element = plugin.get(name)
@@ -185,8 +223,7 @@ class Materials:
 
     def _null(self, plugin):
         plugin.finish()
-        # a surface that is not there: light passes, and it can still emit
-        return description.Mask(opacity=0.0, bsdf=description.Diffuse(reflectance=0.0))
+        return description.Null()
 
     # --- colours and textures ----------------------------------------------------------------------------------
 

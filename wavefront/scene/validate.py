@@ -16,7 +16,7 @@ from wavefront.scene.transforms import to_matrix
 
 MESH_SUFFIXES = (".ply", ".obj", ".gltf", ".glb")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
-_REFLECTING = ("diffuse", "conductor", "rough_conductor")
+_REFLECTING = ("diffuse", "oren_nayar", "conductor", "rough_conductor", "plastic", "rough_plastic")
 _LARGEST = float(np.finfo(np.float32).max)
 
 
@@ -39,7 +39,7 @@ def validate(
                 _check_file(record.file, IMAGE_SUFFIXES, "image", f"{path}.file")
             elif isinstance(record, (description.Conductor, description.RoughConductor)):
                 _check_conductor(record, path)
-            elif isinstance(record, (description.Dielectric, description.RoughDielectric)):
+            elif hasattr(record, "int_ior"):
                 _check_dielectric(record, path)
             elif isinstance(record, description.Mesh):
                 _check_mesh(record, path)
