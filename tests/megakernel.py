@@ -18,9 +18,10 @@ from wavefront.bsdf.dispatch import is_smooth, make_bsdf
 from wavefront.bsdf.tables import KINDS as BSDF_KINDS
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.camera import Camera, camera_ray, make_camera
+from wavefront.light.envmap import make_envmap
 from wavefront.light.sampling import make_light_sampler
+from wavefront.light.tables import KIND_CONSTANT, KIND_ENVMAP_FLOATS, LightTables
 from wavefront.light.tables import KINDS as LIGHT_KINDS
-from wavefront.light.tables import LightTables
 from wavefront.renderer import Renderer
 from wavefront.rng import PURPOSE_BSDF, PURPOSE_CAMERA, PURPOSE_LIGHT, uniform4
 from wavefront.surface import make_vertex, spawn_origin
@@ -28,6 +29,7 @@ from wavefront.texture import TextureTables, make_eval_parameter
 from wavefront.warp_samples import square_to_gaussian, square_to_tent
 
 TEXTURES = ("bytes", "checkerboard", "floats")
+LIGHTS = tuple(sorted(set(LIGHT_KINDS) - {"envmap_bytes"}))  # of environment maps, those of floats
 BOX, TENT, GAUSSIAN = wp.constant(0), wp.constant(1), wp.constant(2)
 FILTERS = {"box": 0, "tent": 1, "gaussian": 2}
 
@@ -46,12 +48,13 @@ class Settings:
 
 
 @functools.cache
-def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
-    """Only what a scene lacks memory for is left out: kinds of primitive, vertex normals and UVs."""
+def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool, nee: bool):
+    """Only what a scene lacks memory for is left out: kinds of primitive, vertex normals, UVs, tables of sampling."""
     closest_hit, occluded = make_intersector(triangles, spheres)
     vertex_of = make_vertex(triangles, spheres, smooth, uvs)
     eval_bsdf, sample_bsdf, _ = make_bsdf(tuple(sorted(BSDF_KINDS)), True, TEXTURES)
-    sample_light, light_pdf = make_light_sampler(tuple(sorted(LIGHT_KINDS)), TEXTURES)
+    sample_light, light_pdf = make_light_sampler(LIGHTS, TEXTURES)
+    eval_envmap, _ = make_envmap(False, nee)
     eval_parameter = make_eval_parameter(TEXTURES)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -91,12 +94,20 @@ def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
             if hit.primitive < 0:
                 if lights.environment >= 0:
                     sky = lights.lights[lights.environment]
+                    Le = wp.vec3(0.0)
+                    b = float(0.0)
+                    if sky.kind == KIND_CONSTANT:
+                        Le = lights.emitters[sky.emitter].radiance
+                        b = sky.pmf / wp.static(4.0 * wp.pi)
+                    if sky.kind == KIND_ENVMAP_FLOATS:
+                        found = eval_envmap(lights.envmap, direction)
+                        Le = found.L
+                        b = sky.pmf * found.pdf
                     w = float(1.0)
                     if settings.nee == 1 and bsdf_pdf > 0.0:
                         a = bsdf_pdf
-                        b = sky.pmf / wp.static(4.0 * wp.pi)
                         w = a * a / (a * a + b * b)
-                    L += w * wp.cw_mul(beta, lights.emitters[sky.emitter].radiance)
+                    L += w * wp.cw_mul(beta, Le)
                 break
             vertex = vertex_of(geometry, origin, direction, hit)
             shape = geometry.shapes[geometry.shape_of[hit.primitive]]
@@ -105,9 +116,7 @@ def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
                 emitter = lights.emitters[lights.lights[index].emitter]
                 w = float(1.0)
                 if settings.nee == 1 and bsdf_pdf > 0.0:
-                    b = light_pdf(
-                        lights, geometry, index, origin, direction, vertex.position, vertex.geometric_normal
-                    )
+                    b = light_pdf(lights, geometry, index, origin, direction, vertex.position, vertex.geometric_normal)
                     ratio = b / bsdf_pdf
                     w = 1.0 / (1.0 + ratio * ratio)
                 Le = eval_parameter(textures, emitter.radiance, emitter.radiance_texture, vertex.uv)
@@ -120,13 +129,13 @@ def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
             facing = is_smooth(materials.materials[shape.material], wp.dot(normal, wo))
             if settings.nee == 1 and facing and lights.lights.shape[0] > 0:
                 u = uniform4(seed, key, sample, segment - 1, PURPOSE_LIGHT)
-                light = sample_light(lights, geometry, textures, vertex.position, wp.vec3(u[0], u[1], u[2]))
+                light = sample_light(lights, geometry, textures, vertex.position, u)
                 if wp.max(light.L) > 0.0:
                     f = eval_bsdf(materials, textures, shape.material, vertex.uv, normal, wo, light.wi)
                     if wp.max(f.value) > 0.0:
                         start = spawn_origin(vertex.position, vertex.geometric_normal, vertex.offset, light.wi)
                         to_light = light.wi
-                        if light.t_max == 1.0:
+                        if light.t_max < 2.0:
                             to_light = light.target - start
                         if not occluded(geometry, start, to_light, light.t_max):
                             ratio = f.pdf / light.pdf
@@ -134,9 +143,7 @@ def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
                             L += (w / light.pdf) * wp.cw_mul(beta, wp.cw_mul(f.value, light.L))
 
             u = uniform4(seed, key, sample, segment - 1, PURPOSE_BSDF)
-            s = sample_bsdf(
-                materials, textures, shape.material, vertex.uv, normal, wo, wp.vec3(u[0], u[1], u[2])
-            )
+            s = sample_bsdf(materials, textures, shape.material, vertex.uv, normal, wo, wp.vec3(u[0], u[1], u[2]))
             beta = wp.cw_mul(beta, s.weight)
             if not wp.max(beta) > 0.0:
                 break
@@ -168,7 +175,7 @@ def render_megakernel(renderer: Renderer, spp: int) -> np.ndarray:
     settings.seed = renderer.seed
     n = film.width * film.height * spp
     result = wp.zeros(n, dtype=wp.vec3, device="cpu")
-    kernel = make_megakernel(f.triangles, f.spheres, f.smooth, f.uvs)
+    kernel = make_megakernel(f.triangles, f.spheres, f.smooth, f.uvs, f.nee)
     d = device_scene
     inputs = [make_camera(scene.camera, film), d.geometry, d.materials, d.textures, d.lights, settings]
     wp.launch(kernel, dim=n, inputs=inputs, outputs=[result], device="cpu")

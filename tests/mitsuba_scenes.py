@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from wavefront.scene.images import write_exr
+
 SIZE = 32  # pixels of a side
 MAX_DEPTH = 5
 
@@ -197,10 +199,34 @@ MIXED: dict[str, list[str]] = {
     ],
 }
 
+_BOX = f"""<shape type="cube"><transform name="to_world"><scale value="0.6"/><rotate y="1" angle="30"/>
+    <translate x="0.2" y="0.6"/></transform>{_PAINT.format("0.7, 0.7, 0.2")}</shape>"""
+
+
+def _envmap(file: str, rotate: str) -> str:
+    return f"""<emitter type="envmap"><string name="filename" value="{file}"/><float name="scale" value="1.5"/>
+    <transform name="to_world">{rotate}</transform></emitter>"""
+
+
+# Emitters that rays find which hit nothing, so that a render without light sampling sees them too.
+AROUND: dict[str, list[str]] = {
+    "envmap": [FLOOR, _BOX, _envmap("sky.exr", "")],
+    "envmap, turned": [FLOOR, _BOX, _envmap("sky.exr", '<rotate x="1" angle="50"/><rotate y="1" angle="110"/>')],
+    "envmap, mirrored": [FLOOR, _BOX, _envmap("sky.exr", '<rotate z="1" angle="35"/><scale x="-1"/>')],
+    "envmap, 8 bit": [FLOOR, _BOX, _envmap("texture.png", '<rotate z="1" angle="35"/>')],
+    "envmap and lamp": [FLOOR, _BOX, LAMP, _envmap("sky.exr", "")],
+}
+
 # Elements of the sensor, and the size of the film.
 CAMERAS: dict[str, tuple[str, tuple[int, int]]] = {
     axis: (f'<string name="fov_axis" value="{axis}"/>', size)
-    for axis, size in (("x", (48, 24)), ("y", (48, 24)), ("diagonal", (48, 24)), ("smaller", (24, 48)), ("larger", (24, 48)))
+    for axis, size in (
+        ("x", (48, 24)),
+        ("y", (48, 24)),
+        ("diagonal", (48, 24)),
+        ("smaller", (24, 48)),
+        ("larger", (24, 48)),
+    )
 }
 
 
@@ -210,6 +236,9 @@ def write_files(folder: Path) -> None:
     texture = rng.integers(20, 250, (5, 7, 3), dtype=np.uint8)
     Image.fromarray(texture).save(folder / "texture.png")
     Image.fromarray(rng.integers(0, 255, (4, 6), dtype=np.uint8)).save(folder / "opacity.png")
+    sky = np.exp(rng.normal(size=(6, 10, 3))).astype(np.float32)
+    sky[2, 3] = (20.0, 16.0, 8.0)
+    write_exr(folder / "sky.exr", {name: sky[:, :, i] for i, name in enumerate("RGB")})
     (folder / "ball.obj").write_text(_ball_obj(8, 12), encoding="utf-8")
 
 

@@ -47,6 +47,8 @@ CHANGES = [
     {"triangles": False, "lights": ("sphere",)},
     {"spheres": False, "lights": ("triangle",)},
     {"textures": (), "light_textures": (), "uvs": False, "lights": ("constant",)},
+    {"lights": ("envmap_floats", "triangle")},
+    {"lights": ("envmap_bytes",)},
     {"nee": False, "filter": "tent", "mask": False},
     {"bsdfs": ("conductor",), "roulette": False, "filter": "box"},
     {"bsdfs": ("dielectric",), "aovs": ("albedo",), "variance": False},

@@ -14,6 +14,7 @@ import pytest
 from tests.megakernel import render_megakernel
 from wavefront import Renderer, load_scene
 from wavefront.scene import description as d
+from wavefront.scene.images import write_exr
 
 SCENES = Path(__file__).parent.parent / "scenes"
 SPP = 4
@@ -125,6 +126,17 @@ def mixed_scene():
 @pytest.mark.parametrize("nee", [True, False])
 def test_mixed_scene(nee):
     scene = mixed_scene()
+    scene.integrator.nee = nee
+    check(scene, spp=8)
+
+
+@pytest.mark.parametrize("nee", [True, False])
+def test_environment_map(tmp_path, nee):
+    pixels = np.exp(np.random.default_rng(1).normal(size=(6, 10, 3))).astype(np.float32)
+    write_exr(tmp_path / "sky.exr", {name: pixels[:, :, i] for i, name in enumerate("RGB")})
+    scene = mixed_scene()
+    scene.shapes = scene.shapes[:-1]  # but the sphere around everything
+    scene.emitters = [d.Envmap(file=str(tmp_path / "sky.exr"), scale=0.7)]
     scene.integrator.nee = nee
     check(scene, spp=8)
 

@@ -119,6 +119,12 @@ def test_mixed(folder, name):
     check_small(folder, name, scenes.document(scenes.MIXED[name], everything=True))
 
 
+@pytest.mark.parametrize("nee", [True, False])
+@pytest.mark.parametrize("name", scenes.AROUND)
+def test_around(folder, name, nee):
+    check_small(folder, name, scenes.document(scenes.AROUND[name], everything=False), nee=nee)
+
+
 @pytest.mark.parametrize("axis", scenes.CAMERAS)
 def test_camera(folder, axis):
     camera, size = scenes.CAMERAS[axis]

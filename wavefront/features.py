@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 
+from wavefront.light import tables
+
 
 @dataclasses.dataclass(frozen=True)
 class Features:
@@ -43,12 +45,13 @@ class Features:
         return any(kind in ("diffuse", "rough_conductor", "rough_dielectric") for kind in self.bsdfs)
 
     @property
-    def environment(self) -> bool:
-        return "constant" in self.lights
+    def escape_lights(self) -> tuple[str, ...]:
+        """Kinds of light that a ray finds which hits nothing."""
+        return tuple(kind for kind in self.lights if kind in tables.ENVIRONMENT)
 
     @property
     def area_lights(self) -> bool:
-        return "triangle" in self.lights or "sphere" in self.lights
+        return any(kind in tables.AREA for kind in self.lights)
 
     @property
     def light_sampling(self) -> bool:

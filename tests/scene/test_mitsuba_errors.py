@@ -28,12 +28,20 @@ def path(body):
     return f'<integrator type="path">\n{body}</integrator>'
 
 
+def envmap(body):
+    return f'<emitter type="envmap"><string name="filename" value="colours.png"/>{body}</emitter>'
+
+
 ERRORS = [
     ('\n\n<shape type="cylinder"/>', 4, "shape 'cylinder' is not supported; supported: obj, ply, rectangle"),
     ('<shape type="serialized"/>', 2, "shape 'serialized' is not supported"),
     (on_shape('\n<bsdf type="plastic"/>'), 3, "bsdf 'plastic' is not supported; supported: diffuse"),
     (bsdf("bumpmap"), 2, "bsdf 'bumpmap' is not supported yet"),
-    ('<emitter type="point"/>', 2, "emitter 'point' is not supported; supported: area, constant"),
+    ('<emitter type="projector"/>', 2, "emitter 'projector' is not supported; supported: area, constant, envmap"),
+    ('<emitter type="envmap"/>', 2, "emitter 'envmap' needs a filename"),
+    (envmap('\n<float name="scale" value="-1"/>'), 3, "scale must be at least 0; found -1"),
+    (envmap('\n<transform name="to_world"><scale x="2"/></transform>'), 3, "an environment map can be rotated"),
+    (envmap('<string name="filename" value="no.exr"/>'.replace("filename", "other")), 2, "no property 'other'"),
     ('<emitter type="area"/>', 2, "belongs inside a shape"),
     (on_shape('<emitter type="spot"/>'), 2, "emitter 'spot' is not supported inside a shape"),
     ('<integrator type="aov"/>', 2, "integrator 'aov' is not supported"),

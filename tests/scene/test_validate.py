@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 
 from wavefront.errors import SceneError
 from wavefront.scene import description as d
 from wavefront.scene import mesh_files
-from wavefront.scene.lookup import resolve_bsdf, resolve_texture, walk
+from wavefront.scene.lookup import resolve_bsdf, resolve_texture, shown, walk
 from wavefront.scene.validate import MESH_SUFFIXES, validate
 
 STEP = d.TransformStep
+TILES = str(Path(__file__).parents[2] / "scenes" / "textures" / "tiles.png")
 STEPS = "translate, rotate, scale, look_at, matrix"
 REFLECTING = "diffuse, conductor, rough_conductor"
 TOO_LARGE = "expected a number of at most 3.403e+38, as 32-bit floats are; found"
@@ -171,7 +173,7 @@ def moved(*transform, shape=d.Rectangle):
         (d.Scene(shapes=[d.Mesh(file="/none/a.ply")]), "shapes[0].file: file not found: '/none/a.ply'"),
         (
             d.Scene(textures=[d.Bitmap(file="/none/a.tif")]),
-            "textures[0].file: unknown image format '.tif' of '/none/a.tif'; allowed: .png, .jpg, .jpeg, .exr",
+            "textures[0].file: unknown image format '.tif' of '/none/a.tif'; allowed: .png, .jpg, .jpeg, .exr, .hdr",
         ),
         (
             with_bsdfs(d.Diffuse(reflectance=d.Bitmap(file="/none/a.png"))),
@@ -180,7 +182,20 @@ def moved(*transform, shape=d.Rectangle):
         # The rest
         (
             d.Scene(emitters=[d.Constant(), d.Constant()]),
-            "emitters[1]: a scene has at most one constant environment; found 2",
+            "emitters[1]: a scene has at most one environment; emitters[0] is one already",
+        ),
+        (
+            d.Scene(emitters=[d.Envmap(file="/none/sky.png")]),
+            "emitters[0].file: file not found: '/none/sky.png'",
+        ),
+        (
+            d.Scene(emitters=[d.Envmap(file=__file__)]),
+            f"emitters[0].file: unknown image format '.py' of {shown(__file__)}; "
+            "allowed: .png, .jpg, .jpeg, .exr, .hdr",
+        ),
+        (
+            d.Scene(emitters=[d.Envmap(file=TILES, to_world=[d.TransformStep(scale=(1.0, 2.0, 1.0))])]),
+            "emitters[0].to_world: an environment can be rotated; found different scales or a shear",
         ),
         (d.Scene(film=d.Film(aovs=["depth", "depth"])), "film.aovs[1]: 'depth' is given twice"),
     ],

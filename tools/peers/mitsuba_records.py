@@ -50,7 +50,7 @@ class _Writer:
             "sensor": self._camera(),
         }
         for i, emitter in enumerate(self.scene.emitters):
-            result[f"emitter_{i}"] = {"type": "constant", "radiance": _colour(emitter.radiance)}
+            result[f"emitter_{i}"] = self._emitter(emitter, f"emitters[{i}]")
         for i, shape in enumerate(self.scene.shapes):
             result[f"shape_{i}"] = self._shape(i, shape)
         return result
@@ -80,6 +80,18 @@ class _Writer:
 
     def _transform(self, matrix):
         return self.mi.ScalarTransform4f(np.asarray(matrix, np.float64).tolist())
+
+    # --- emitters ------------------------------------------------------------------------------------------------
+
+    def _emitter(self, emitter, where):
+        if isinstance(emitter, description.Constant):
+            return {"type": "constant", "radiance": _colour(emitter.radiance)}
+        return {
+            "type": "envmap",
+            "filename": emitter.file,
+            "scale": emitter.scale,
+            "to_world": self._transform(to_matrix(emitter.to_world, f"{where}.to_world")),
+        }
 
     # --- shapes --------------------------------------------------------------------------------------------------
 

@@ -7,7 +7,15 @@ import functools
 import warp as wp
 
 from wavefront.accel.mesh_query import INFINITE, Geometry
-from wavefront.light.tables import KIND_CONSTANT, KIND_SPHERE, KIND_TRIANGLE, LightTables
+from wavefront.light.envmap import make_envmap
+from wavefront.light.tables import (
+    KIND_CONSTANT,
+    KIND_ENVMAP_BYTES,
+    KIND_ENVMAP_FLOATS,
+    KIND_SPHERE,
+    KIND_TRIANGLE,
+    LightTables,
+)
 from wavefront.surface import position_error, sphere_uv
 from wavefront.texture import TextureTables, make_eval_parameter
 from wavefront.warp_samples import (
@@ -21,11 +29,15 @@ from wavefront.warp_samples import (
 )
 
 
+# A shadow ray ends short of its light by some roundings of the distance: the ray-triangle test is no better than that.
+SHADOW_END = wp.constant(1.0 - 2.0**-16)
+
+
 @wp.struct
 class LightSample:
     wi: wp.vec3  # unit vector towards the light
     target: wp.vec3  # where the shadow ray ends; unused for the environment
-    t_max: wp.float32  # of a shadow ray to the target: 1, or INFINITE for the environment
+    t_max: wp.float32  # of a shadow ray to the target: SHADOW_END, or INFINITE for the environment
     L: wp.vec3  # emitted radiance; zero if the sample is useless
     pdf: wp.float32  # in solid angle, selection included
 
@@ -34,10 +46,9 @@ class LightSample:
 def select_light(lights: LightTables, u: float) -> int:
     """Index of a light drawn from the alias table."""
     n = lights.lights.shape[0]
-    scaled = u * float(n)
-    cell = wp.min(int(scaled), n - 1)
+    cell = wp.min(int(u * float(n)), n - 1)
     light = lights.lights[cell]
-    return wp.where(scaled - float(cell) < light.alias_threshold, cell, light.alias)
+    return wp.where(u < light.alias_threshold, cell, light.alias)
 
 
 @wp.func
@@ -63,24 +74,26 @@ def make_light_sampler(kinds: tuple[str, ...], textures: tuple[str, ...]):
     Returns:
         `sample_light(lights, geometry, textures, p, u) -> LightSample` for a point p, and
         `light_pdf(lights, geometry, light, p, wi, q, normal) -> float`, the density in solid angle with which that
-        would have chosen the point q (with its normal) of a light, seen from p in direction wi.
+        would have chosen the point q (with its normal) of an area light, seen from p in direction wi.
     """
     has_triangle = "triangle" in kinds
     has_sphere = "sphere" in kinds
     has_constant = "constant" in kinds
+    has_envmap = "envmap_bytes" in kinds or "envmap_floats" in kinds
+    eval_envmap, sample_envmap = make_envmap("envmap_bytes" in kinds)
     textured = bool(textures)
     eval_parameter = make_eval_parameter(textures)
 
     @wp.func
     def sample_light(
-        lights: LightTables, geometry: Geometry, textures: TextureTables, p: wp.vec3, u: wp.vec3
+        lights: LightTables, geometry: Geometry, textures: TextureTables, p: wp.vec3, u: wp.vec4
     ) -> LightSample:
         result = LightSample()
-        result.t_max = 1.0
+        result.t_max = SHADOW_END
         light = lights.lights[select_light(lights, u[0])]
-        emitter = lights.emitters[light.emitter]
         if wp.static(has_triangle):
             if light.kind == KIND_TRIANGLE:
+                emitter = lights.emitters[light.emitter]
                 i0 = geometry.indices[3 * light.primitive]
                 i1 = geometry.indices[3 * light.primitive + 1]
                 i2 = geometry.indices[3 * light.primitive + 2]
@@ -115,6 +128,7 @@ def make_light_sampler(kinds: tuple[str, ...], textures: tuple[str, ...]):
                     result.L = eval_parameter(textures, emitter.radiance, emitter.radiance_texture, uv)
         if wp.static(has_sphere):
             if light.kind == KIND_SPHERE:
+                emitter = lights.emitters[light.emitter]
                 sphere = geometry.spheres[light.primitive - geometry.triangle_count]
                 inwards = geometry.shapes[geometry.shape_of[light.primitive]].flip == 1
                 center = wp.vec3(sphere[0], sphere[1], sphere[2])
@@ -156,7 +170,15 @@ def make_light_sampler(kinds: tuple[str, ...], textures: tuple[str, ...]):
                 result.wi = square_to_sphere(wp.vec2(u[1], u[2]))
                 result.t_max = INFINITE
                 result.pdf = light.pmf * sphere_pdf()
-                result.L = emitter.radiance
+                result.L = lights.emitters[light.emitter].radiance
+        if wp.static(has_envmap):
+            if light.kind == KIND_ENVMAP_BYTES or light.kind == KIND_ENVMAP_FLOATS:
+                result.wi = sample_envmap(lights.envmap, wp.vec3(u[1], u[2], u[3]))
+                # Radiance and density of the rounded direction: what a ray that escapes in it will find.
+                found = eval_envmap(lights.envmap, result.wi)
+                result.t_max = INFINITE
+                result.pdf = light.pmf * found.pdf
+                result.L = wp.where(found.pdf > 0.0, found.L, wp.vec3(0.0))
         return result
 
     @wp.func
@@ -181,9 +203,6 @@ def make_light_sampler(kinds: tuple[str, ...], textures: tuple[str, ...]):
                 else:
                     pdf = sphere_pdf() * wp.length_sq(q - p)
                     pdf /= wp.abs(wp.dot(normal, wi)) * sphere[3] * sphere[3]
-        if wp.static(has_constant):
-            if light.kind == KIND_CONSTANT:
-                pdf = sphere_pdf()
         return light.pmf * pdf
 
     return sample_light, light_pdf

@@ -73,14 +73,14 @@ IDENTITY_UV = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 
 
 class Bitmap(Record, tag_field="type", tag="bitmap"):
-    """An image file: PNG or JPEG (8 bit), or OpenEXR."""
+    """An image file: PNG or JPEG (8 bit), OpenEXR, or Radiance HDR."""
 
     file: Annotated[str, Meta(description="Path of the image, relative to the scene file.", min_length=1)]
     name: str = ""
     color_space: Annotated[
         Literal["auto", "srgb", "linear"],
         Meta(
-            description="How values are encoded; auto: 8-bit colours are sRGB, OpenEXR and scalar parameters are linear."
+            description="How values are encoded; auto: 8-bit colours are sRGB, other images and all numbers are linear."
         ),
     ] = "auto"
     filter: Literal["bilinear", "nearest"] = "bilinear"
@@ -203,7 +203,22 @@ class Constant(Record, tag_field="type", tag="constant"):
     radiance: NonNegative | RGB = 1.0
 
 
-Emitter = Constant
+class Envmap(Record, tag_field="type", tag="envmap"):
+    """An image of the environment in latitude and longitude: its middle is at local -Z, its first row at +Y.
+
+    The columns go clockwise seen from above, from +Z over +X. The first and the last row are the poles themselves.
+    """
+
+    file: Annotated[
+        str,
+        Meta(description="OpenEXR, Radiance HDR, PNG or JPEG (8 bit, sRGB), relative to the scene file.", min_length=1),
+    ]
+    name: str = ""
+    scale: Annotated[NonNegative, Meta(description="Multiplies the image.")] = 1.0
+    to_world: Annotated[Transform, Meta(description="A rotation or a mirror; other parts have no meaning here.")] = []
+
+
+Emitter = Constant | Envmap
 
 # --- shapes ----------------------------------------------------------------------------------------------------
 
@@ -329,9 +344,7 @@ class Scene(Record):
     integrator: PathIntegrator = msgspec.field(default_factory=PathIntegrator)
     textures: Annotated[list[Texture], Meta(description="Named textures.")] = []
     bsdfs: Annotated[list[Bsdf], Meta(description="Named BSDFs.")] = []
-    emitters: Annotated[
-        list[Emitter], Meta(description="Emitters that are not shapes; at most one constant environment.")
-    ] = []
+    emitters: Annotated[list[Emitter], Meta(description="Emitters that are not shapes; at most one environment.")] = []
     include: Annotated[
         list[str], Meta(description="Scene files whose textures, bsdfs, emitters and shapes are added to this one.")
     ] = []

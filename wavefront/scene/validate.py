@@ -15,7 +15,7 @@ from wavefront.scene.lookup import BSDF_FIELDS, NUMBER_FIELDS, TEXTURE_FIELDS, s
 from wavefront.scene.transforms import to_matrix
 
 MESH_SUFFIXES = (".ply", ".obj", ".gltf", ".glb")
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".hdr")
 _REFLECTING = ("diffuse", "conductor", "rough_conductor")
 _LARGEST = float(np.finfo(np.float32).max)
 
@@ -35,7 +35,7 @@ def validate(
         for path, record in walk(scene):
             _check_numbers(record, path)
             _check_references(record, path, bsdfs, textures)
-            if isinstance(record, description.Bitmap):
+            if isinstance(record, (description.Bitmap, description.Envmap)):
                 _check_file(record.file, IMAGE_SUFFIXES, "image", f"{path}.file")
             elif isinstance(record, (description.Conductor, description.RoughConductor)):
                 _check_conductor(record, path)
@@ -52,8 +52,7 @@ def validate(
                     f"shapes[{i}].to_world", "a sphere can be scaled uniformly only; found different scales or a shear"
                 )
         _check_transform(scene.camera.to_world, "camera.to_world")
-        if len(scene.emitters) > 1:
-            _fail("emitters[1]", f"a scene has at most one constant environment; found {len(scene.emitters)}")
+        _check_emitters(scene)
         for i, aov in enumerate(scene.film.aovs):
             if aov in scene.film.aovs[:i]:
                 _fail(f"film.aovs[{i}]", f"{aov!r} is given twice")
@@ -152,6 +151,23 @@ def _check_cycle(name, path, bsdfs):
             for field in BSDF_FIELDS.intersection(record.__struct_fields__):
                 if isinstance(getattr(record, field), str):
                     stack.append((getattr(record, field), depth + 1))
+
+
+# --- emitters --------------------------------------------------------------------------------------------------
+
+
+def _check_emitters(scene):
+    environment = None
+    for i, emitter in enumerate(scene.emitters):
+        path = f"emitters[{i}]"
+        if isinstance(emitter, (description.Constant, description.Envmap)):
+            if environment is not None:
+                _fail(path, f"a scene has at most one environment; {environment} is one already")
+            environment = path
+        if isinstance(emitter, description.Envmap):
+            matrix = _check_transform(emitter.to_world, f"{path}.to_world")
+            if matrix is not None and not _is_similarity(matrix):
+                _fail(f"{path}.to_world", "an environment can be rotated; found different scales or a shear")
 
 
 # --- shapes ----------------------------------------------------------------------------------------------------

@@ -68,7 +68,7 @@ def make_direct(
         # propose
         u = uniform4(seed, paths.pixel[slot], paths.sample[slot], counters[DEPTH], PURPOSE_LIGHT)
         position = surfaces.position[slot]
-        light = sample_light(lights, geometry, textures, position, wp.vec3(u[0], u[1], u[2]))
+        light = sample_light(lights, geometry, textures, position, u)
         if light.L[0] + light.L[1] + light.L[2] == 0.0:
             return
 
