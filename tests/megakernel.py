@@ -108,6 +108,16 @@ def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool, nee
                         a = bsdf_pdf
                         w = a * a / (a * a + b * b)
                     L += w * wp.cw_mul(beta, Le)
+                for k in range(lights.sun_count):
+                    index = lights.first_sun + k
+                    disc = lights.distant[lights.lights[index].emitter]
+                    if wp.length_sq(direction - disc.direction) <= 2.0 * disc.one_minus_cos:
+                        w = float(1.0)
+                        if settings.nee == 1 and bsdf_pdf > 0.0:
+                            b = lights.lights[index].pmf / (wp.static(2.0 * wp.pi) * disc.one_minus_cos)
+                            ratio = b / bsdf_pdf
+                            w = 1.0 / (1.0 + ratio * ratio)
+                        L += w * wp.cw_mul(beta, disc.emitted)
                 break
             vertex = vertex_of(geometry, origin, direction, hit)
             shape = geometry.shapes[geometry.shape_of[hit.primitive]]
@@ -140,6 +150,8 @@ def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool, nee
                         if not occluded(geometry, start, to_light, light.t_max):
                             ratio = f.pdf / light.pdf
                             w = 1.0 / (1.0 + ratio * ratio)
+                            if light.delta == 1:
+                                w = 1.0
                             L += (w / light.pdf) * wp.cw_mul(beta, wp.cw_mul(f.value, light.L))
 
             u = uniform4(seed, key, sample, segment - 1, PURPOSE_BSDF)

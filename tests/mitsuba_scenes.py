@@ -217,6 +217,62 @@ AROUND: dict[str, list[str]] = {
     "envmap and lamp": [FLOOR, _BOX, LAMP, _envmap("sky.exr", "")],
 }
 
+_SPOT = """<emitter type="spot"><transform name="to_world"><lookat origin="1, 4, 2" target="0, 0.3, 0" up="0, 1, 0"/>
+    </transform><rgb name="intensity" value="50, 40, 30"/>{}</emitter>"""
+_POINT = """<emitter type="point"><point name="position" x="-1.5" y="2" z="1"/>
+    <rgb name="intensity" value="6, 7, 9"/></emitter>"""
+
+# Emitters that only light sampling finds.
+DELTA: dict[str, list[str]] = {
+    "point": [FLOOR, _BOX, _POINT],
+    "spot": [FLOOR, _BOX, _SPOT.format("")],
+    "spot, even": [
+        FLOOR,
+        _BOX,
+        _SPOT.format('<float name="cutoff_angle" value="25"/><float name="beam_width" value="25"/>'),
+    ],
+    "spot, wide": [
+        FLOOR,
+        _BOX,
+        _SPOT.format('<float name="cutoff_angle" value="120"/><float name="beam_width" value="10"/>'),
+    ],
+    "directional": [
+        FLOOR,
+        _BOX,
+        """<emitter type="directional"><vector name="direction" x="1" y="-2" z="-0.5"/>
+    <rgb name="irradiance" value="3, 2.5, 2"/></emitter>""",
+    ],
+    "directional, turned": [
+        FLOOR,
+        _BOX,
+        """<emitter type="directional"><transform name="to_world"><rotate x="1" angle="60"/><rotate y="1" angle="30"/>
+    </transform></emitter>""",
+    ],
+    "all of them": [
+        FLOOR,
+        _BOX,
+        LAMP,
+        SKY,
+        _SPOT.format(""),
+        _POINT,
+        '<emitter type="directional"><vector name="direction" x="0.3" y="-1" z="0"/></emitter>',
+    ],
+}
+
+# A ball so far away that it is a disc of an angular radius of 8 degrees from everywhere in the scene.
+SUN_DIRECTION, SUN_ANGLE, SUN_RADIANCE = (0.6, -1.0, -0.3), 8.0, (40.0, 30.0, 20.0)
+
+
+def far_ball() -> str:
+    axis, distance = np.array(SUN_DIRECTION) / np.linalg.norm(SUN_DIRECTION), 1e5
+    x, y, z = -distance * axis
+    return f"""<shape type="sphere"><point name="center" x="{x}" y="{y}" z="{z}"/>
+    <float name="radius" value="{distance * np.sin(np.radians(SUN_ANGLE))}"/><emitter type="area">
+    <rgb name="radiance" value="{SUN_RADIANCE[0]}, {SUN_RADIANCE[1]}, {SUN_RADIANCE[2]}"/></emitter></shape>"""
+
+
+SUN = [FLOOR, _BOX, far_ball()]
+
 # Elements of the sensor, and the size of the film.
 CAMERAS: dict[str, tuple[str, tuple[int, int]]] = {
     axis: (f'<string name="fov_axis" value="{axis}"/>', size)

@@ -141,6 +141,22 @@ def test_environment_map(tmp_path, nee):
     check(scene, spp=8)
 
 
+@pytest.mark.parametrize("nee", [True, False])
+def test_lights_from_afar_and_from_points(nee):
+    """Two suns that overlap, and one of each light without extent, beside lamps and an environment."""
+    scene = mixed_scene()
+    scene.shapes = scene.shapes[:-1]
+    scene.emitters += [
+        d.Sun(direction=(0.3, -1.0, -0.2), angle=20.0, radiance=[3.0, 2.0, 1.0]),
+        d.Directional(direction=(-1.0, -1.0, 0.0), irradiance=0.5),
+        d.Point(position=(0.5, 2.0, 2.0), intensity=[0.5, 0.7, 0.9]),
+        d.Sun(direction=(0.5, -1.0, -0.2), angle=10.0, irradiance=0.5),
+        d.Spot(position=(0.0, 3.0, 0.0), direction=(0.0, -1.0, 0.1), intensity=3.0),
+    ]
+    scene.integrator.nee = nee
+    check(scene, spp=8)
+
+
 def test_spheres_and_environment_only():
     """No triangles, no textures, and lights that are spheres seen from outside, from inside and from close by."""
     scene = mixed_scene()

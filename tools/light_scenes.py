@@ -7,14 +7,42 @@ from pathlib import Path
 import numpy as np
 
 from tools.scene_parts import box, film, look_at, place, rectangle
-from wavefront.scene.description import Diffuse, Emitter, Envmap, PathIntegrator, Perspective, Scene, Sphere
+from wavefront.scene.description import (
+    Diffuse,
+    Directional,
+    Emitter,
+    Envmap,
+    PathIntegrator,
+    Perspective,
+    Point,
+    Scene,
+    Sphere,
+    Spot,
+    Sun,
+)
 from wavefront.scene.images import write_exr
 
 
 def scenes(folder: Path) -> dict[str, Scene]:
     """Each light over the same floor, ball and box."""
     sky = Envmap(file=str(folder / "textures" / "sky.exr"), to_world=place(rotate=("y", 30.0)))
-    return {"envmap": _scene("an environment map with a bright spot, turned", sky)}
+    down = (0.55, -1.0, -0.6)
+    return {
+        "envmap": _scene("an environment map with a bright spot, turned", sky),
+        "directional": _scene("parallel, with hard shadows", Directional(direction=down, irradiance=3.0)),
+        "point": _scene("a point", Point(position=(-1.6, 2.4, 1.6), intensity=[12.0, 11.0, 9.0])),
+        "spot": _scene(
+            "a spot that falls off to its rim",
+            Spot(
+                position=(-1.5, 3.5, 1.5),
+                direction=(1.5, -3.2, -1.5),
+                intensity=40.0,
+                cutoff_angle=24.0,
+                beam_width=14.0,
+            ),
+        ),
+        "sun": _scene("a sun 6 degrees wide, with soft shadows", Sun(direction=down, angle=3.0, irradiance=3.0)),
+    }
 
 
 def _scene(what: str, emitter: Emitter) -> Scene:

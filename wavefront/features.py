@@ -47,7 +47,7 @@ class Features:
     @property
     def escape_lights(self) -> tuple[str, ...]:
         """Kinds of light that a ray finds which hits nothing."""
-        return tuple(kind for kind in self.lights if kind in tables.ENVIRONMENT)
+        return tuple(kind for kind in self.lights if kind in (*tables.ENVIRONMENT, "sun"))
 
     @property
     def area_lights(self) -> bool:

@@ -304,6 +304,10 @@ def full_scene(folder):
                 scale=0.5,
                 to_world=[step(rotate=d.Rotate(axis=(1.0, 0.0, 0.0), angle=9.0))],
             ),
+            d.Directional(name="d", direction=(0.0, -1.0, 0.5), irradiance=2.0),
+            d.Point(name="p", position=(0.0, 1.0, 0.5), intensity=[1.0, 0.0, 1e8]),
+            d.Spot(position=(0.0, 1.0, 0.5), direction=(0.0, 0.0, 2.0), cutoff_angle=180.0, beam_width=0.0),
+            d.Sun(direction=(1.0, 1.0, 0.5), angle=0.5, radiance=[1.0, 2.0, 3.0]),
         ],
         shapes=[
             d.Mesh(name="m", file=str(folder / "m.ply"), flip_v=True, bsdf="g"),

@@ -185,6 +185,18 @@ def moved(*transform, shape=d.Rectangle):
             "emitters[1]: a scene has at most one environment; emitters[0] is one already",
         ),
         (
+            d.Scene(emitters=[d.Constant(), d.Sun(direction=(0.0, 0.0, 0.0))]),
+            "emitters[1].direction: the direction is zero",
+        ),
+        (
+            d.Scene(emitters=[d.Sun(direction=(0.0, 1.0, 0.0), radiance=1.0, irradiance=1.0)]),
+            "emitters[0]: a sun has irradiance or radiance; found both",
+        ),
+        (
+            d.Scene(emitters=[d.Spot(position=(0.0, 0.0, 0.0), direction=(0.0, 1.0, 0.0), beam_width=21.0)]),
+            "emitters[0].beam_width: expected at most cutoff_angle; found 21 and 20",
+        ),
+        (
             d.Scene(emitters=[d.Envmap(file="/none/sky.png")]),
             "emitters[0].file: file not found: '/none/sky.png'",
         ),
@@ -204,6 +216,21 @@ def test_a_scene_that_makes_no_sense_is_refused_with_the_place(scene, message):
     with pytest.raises(SceneError) as caught:
         validate(scene, "s.json")
     assert str(caught.value) == f"s.json: {message}"
+
+
+@pytest.mark.parametrize("nee", [True, False])
+def test_a_light_that_no_ray_meets_is_a_warning_without_light_sampling(nee):
+    lights = [
+        d.Directional(direction=(0.0, -1.0, 0.0)),
+        d.Constant(),
+        d.Point(position=(0.0, 1.0, 0.0)),
+        d.Spot(position=(0.0, 1.0, 0.0), direction=(0.0, -1.0, 0.0)),
+        d.Sun(direction=(0.0, -1.0, 0.0)),
+    ]
+    scene = d.Scene(shapes=[d.Cube()], emitters=lights, integrator=d.PathIntegrator(nee=nee))
+    kinds = {} if nee else {0: "directional", 2: "point", 3: "spot"}
+    text = "emitters[{}]: a {} light adds nothing where integrator.nee is false: no ray meets it"
+    assert validate(scene) == [text.format(i, kind) for i, kind in kinds.items()]
 
 
 def test_unknown_metals_are_named_with_the_nearest():

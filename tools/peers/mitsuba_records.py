@@ -86,6 +86,27 @@ class _Writer:
     def _emitter(self, emitter, where):
         if isinstance(emitter, description.Constant):
             return {"type": "constant", "radiance": _colour(emitter.radiance)}
+        if isinstance(emitter, description.Directional):
+            return {
+                "type": "directional",
+                "direction": list(emitter.direction),
+                "irradiance": _colour(emitter.irradiance),
+            }
+        if isinstance(emitter, description.Point):
+            return {"type": "point", "position": list(emitter.position), "intensity": _colour(emitter.intensity)}
+        if isinstance(emitter, description.Spot):
+            target = np.add(emitter.position, emitter.direction)
+            up = np.eye(3)[int(np.argmin(np.abs(emitter.direction)))]
+            beam = 0.75 * emitter.cutoff_angle if emitter.beam_width is None else emitter.beam_width
+            return {
+                "type": "spot",
+                "to_world": self.mi.ScalarTransform4f().look_at(list(emitter.position), target.tolist(), up.tolist()),
+                "intensity": _colour(emitter.intensity),
+                "cutoff_angle": emitter.cutoff_angle,
+                "beam_width": beam,
+            }
+        if isinstance(emitter, description.Sun):
+            raise WavefrontError(f"{where}: Mitsuba has no sun that is a disc alone")
         return {
             "type": "envmap",
             "filename": emitter.file,

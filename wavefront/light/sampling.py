@@ -7,12 +7,18 @@ import functools
 import warp as wp
 
 from wavefront.accel.mesh_query import INFINITE, Geometry
+from wavefront.light.delta import spot_falloff
 from wavefront.light.envmap import make_envmap
+from wavefront.light.sun import sample_sun
 from wavefront.light.tables import (
     KIND_CONSTANT,
+    KIND_DIRECTIONAL,
     KIND_ENVMAP_BYTES,
     KIND_ENVMAP_FLOATS,
+    KIND_POINT,
     KIND_SPHERE,
+    KIND_SPOT,
+    KIND_SUN,
     KIND_TRIANGLE,
     LightTables,
 )
@@ -39,7 +45,8 @@ class LightSample:
     target: wp.vec3  # where the shadow ray ends; unused for the environment
     t_max: wp.float32  # of a shadow ray to the target: SHADOW_END, or INFINITE for the environment
     L: wp.vec3  # emitted radiance; zero if the sample is useless
-    pdf: wp.float32  # in solid angle, selection included
+    pdf: wp.float32  # in solid angle, selection included; of a light without extent, the probability of its selection
+    delta: wp.int32  # 1: a light without extent, of which L is the irradiance on a surface that faces it
 
 
 @wp.func
@@ -81,6 +88,10 @@ def make_light_sampler(kinds: tuple[str, ...], textures: tuple[str, ...]):
     has_constant = "constant" in kinds
     has_envmap = "envmap_bytes" in kinds or "envmap_floats" in kinds
     eval_envmap, sample_envmap = make_envmap("envmap_bytes" in kinds)
+    has_directional = "directional" in kinds
+    has_point = "point" in kinds or "spot" in kinds
+    has_spot = "spot" in kinds
+    has_sun = "sun" in kinds
     textured = bool(textures)
     eval_parameter = make_eval_parameter(textures)
 
@@ -179,6 +190,35 @@ def make_light_sampler(kinds: tuple[str, ...], textures: tuple[str, ...]):
                 result.t_max = INFINITE
                 result.pdf = light.pmf * found.pdf
                 result.L = wp.where(found.pdf > 0.0, found.L, wp.vec3(0.0))
+        if wp.static(has_directional):
+            if light.kind == KIND_DIRECTIONAL:
+                distant = lights.distant[light.emitter]
+                result.wi = distant.direction
+                result.t_max = INFINITE
+                result.pdf = light.pmf
+                result.L = distant.emitted
+                result.delta = 1
+        if wp.static(has_point):
+            if light.kind == KIND_POINT or light.kind == KIND_SPOT:
+                point = lights.points[light.emitter]
+                to_light = point.position - p
+                distance2 = wp.dot(to_light, to_light)
+                if distance2 > 0.0:
+                    result.wi = wp.normalize(to_light)
+                    result.target = point.position
+                    result.pdf = light.pmf
+                    result.L = point.intensity / distance2
+                    result.delta = 1
+                    if wp.static(has_spot):
+                        if light.kind == KIND_SPOT:
+                            result.L *= spot_falloff(point, -result.wi)
+        if wp.static(has_sun):
+            if light.kind == KIND_SUN:
+                distant = lights.distant[light.emitter]
+                result.wi = sample_sun(distant, wp.vec2(u[1], u[2]))
+                result.t_max = INFINITE
+                result.pdf = light.pmf * cone_pdf(distant.one_minus_cos)
+                result.L = distant.emitted
         return result
 
     @wp.func

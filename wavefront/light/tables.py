@@ -12,7 +12,22 @@ KIND_SPHERE = wp.constant(1)
 KIND_CONSTANT = wp.constant(2)
 KIND_ENVMAP_BYTES = wp.constant(3)
 KIND_ENVMAP_FLOATS = wp.constant(4)
-KINDS = {"triangle": 0, "sphere": 1, "constant": 2, "envmap_bytes": 3, "envmap_floats": 4}
+KIND_DIRECTIONAL = wp.constant(5)
+KIND_POINT = wp.constant(6)
+KIND_SPOT = wp.constant(7)
+KIND_SUN = wp.constant(8)
+KINDS = {
+    "triangle": 0,
+    "sphere": 1,
+    "constant": 2,
+    "envmap_bytes": 3,
+    "envmap_floats": 4,
+    "directional": 5,
+    "point": 6,
+    "spot": 7,
+    "sun": 8,
+}
+DELTA = ("directional", "point", "spot")  # those that no ray can find
 AREA = ("triangle", "sphere")  # those that are shapes
 ENVIRONMENT = ("constant", "envmap_bytes", "envmap_floats")  # of which a scene has one at most
 
@@ -36,11 +51,35 @@ class EmitterRecord:
 
 
 @wp.struct
+class DistantRecord:
+    """A directional light or a sun."""
+
+    direction: wp.vec3  # towards the light, unit length
+    one_minus_cos: wp.float32  # of the sun's angular radius
+    emitted: wp.vec3  # irradiance of a directional light, radiance of a sun
+
+
+@wp.struct
+class PointRecord:
+    """A point or a spot light."""
+
+    position: wp.vec3
+    intensity: wp.vec3
+    direction: wp.vec3  # of a spot: its axis, unit length
+    beam_width: wp.float32  # radians
+    cutoff_angle: wp.float32
+
+
+@wp.struct
 class LightTables:
     lights: wp.array[Light]
     emitters: wp.array[EmitterRecord]
     environment: wp.int32  # its light; -1: none
     envmap: EnvironmentMap
+    distant: wp.array[DistantRecord]
+    points: wp.array[PointRecord]
+    first_sun: wp.int32  # suns are consecutive lights
+    sun_count: wp.int32
 
 
 def build_alias_table(power: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

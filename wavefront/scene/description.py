@@ -218,7 +218,55 @@ class Envmap(Record, tag_field="type", tag="envmap"):
     to_world: Annotated[Transform, Meta(description="A rotation or a mirror; other parts have no meaning here.")] = []
 
 
-Emitter = Constant | Envmap
+class Directional(Record, tag_field="type", tag="directional"):
+    """Parallel light from infinitely far away. Found by next-event estimation only."""
+
+    direction: Annotated[Vec3, Meta(description="Where the light travels to.")]
+    name: str = ""
+    irradiance: Annotated[NonNegative | RGB, Meta(description="On a surface that faces the light, W / m^2.")] = 1.0
+
+
+class Point(Record, tag_field="type", tag="point"):
+    """Light from a point, the same in all directions. Found by next-event estimation only."""
+
+    position: Vec3
+    name: str = ""
+    intensity: Annotated[NonNegative | RGB, Meta(description="W / sr")] = 1.0
+
+
+class Spot(Record, tag_field="type", tag="spot"):
+    """Light from a point into a cone: full up to beam_width, from there falling linearly with the angle to zero.
+
+    Found by next-event estimation only.
+    """
+
+    position: Vec3
+    direction: Annotated[Vec3, Meta(description="Axis of the cone, away from the light.")]
+    name: str = ""
+    intensity: Annotated[NonNegative | RGB, Meta(description="Along the axis, W / sr.")] = 1.0
+    cutoff_angle: Annotated[
+        float, Meta(gt=0.0, le=180.0, description="Where the light ends, degrees from the axis.")
+    ] = 20.0
+    beam_width: Annotated[
+        Annotated[float, Meta(ge=0.0, le=180.0)] | None,
+        Meta(description="Where it begins to fall, degrees from the axis; default: 3/4 of cutoff_angle."),
+    ] = None
+
+
+class Sun(Record, tag_field="type", tag="sun"):
+    """A disc of even radiance, infinitely far away."""
+
+    direction: Annotated[Vec3, Meta(description="Where the light of its centre travels to.")]
+    name: str = ""
+    angle: Annotated[float, Meta(gt=0.0, le=90.0, description="Angular radius of the disc, degrees.")] = 0.2665
+    irradiance: Annotated[
+        NonNegative | RGB | None,
+        Meta(description="On a surface that faces the light, W / m^2; excludes radiance. Default: 1."),
+    ] = None
+    radiance: Annotated[NonNegative | RGB | None, Meta(description="Of the disc, W / (m^2 sr).")] = None
+
+
+Emitter = Constant | Envmap | Directional | Point | Spot | Sun
 
 # --- shapes ----------------------------------------------------------------------------------------------------
 

@@ -35,6 +35,8 @@ class LightUpload:
         self.device, self.notes = device, notes
         self.tables = tables.LightTables()
         self.tables.environment = -1
+        self.points: list[tables.PointRecord] = []
+        self.distant: list[tables.DistantRecord] = []
         self.count = 0
         self.columns: dict[str, list[np.ndarray]] = {"kind": [], "primitive": [], "emitter": [], "power": []}
 
@@ -62,8 +64,19 @@ class LightUpload:
         for i, emitter in enumerate(self.scene.emitters):
             if isinstance(emitter, description.Constant):
                 self._constant(emitter, cross_section)
-            else:
+            elif isinstance(emitter, description.Envmap):
                 self._envmap(emitter, f"emitters[{i}]", cross_section)
+            elif isinstance(emitter, (description.Point, description.Spot)):
+                self._point(emitter)
+            elif isinstance(emitter, description.Directional):
+                self._distant("directional", emitter.direction, 0.0, _rgb(emitter.irradiance), cross_section)
+        self.tables.first_sun = self.count
+        for emitter in self.scene.emitters:
+            if isinstance(emitter, description.Sun):
+                self._sun(emitter, cross_section)
+        self.tables.sun_count = self.count - self.tables.first_sun
+        self.tables.points = wp.array(self.points, dtype=tables.PointRecord, device=self.device)
+        self.tables.distant = wp.array(self.distant, dtype=tables.DistantRecord, device=self.device)
         return self._finish([record for record, *_ in [*meshes, *spheres]])
 
     def _add(self, kind: str, power, emitter: int, primitive=-1) -> int:
@@ -81,7 +94,7 @@ class LightUpload:
         if not columns["power"].sum() > 0.0:  # black emitters: nothing to sample, and nothing to find
             for record in shapes:
                 record["first_light"] = -1
-            self.tables.environment, self.count = -1, 0
+            self.tables.environment, self.tables.sun_count, self.count = -1, 0, 0
         host = np.zeros(self.count, dtype=tables.Light.numpy_dtype())
         if self.count:
             for name in ("kind", "primitive", "emitter"):
@@ -122,6 +135,45 @@ class LightUpload:
         self.tables.envmap = env
         power = cross_section * emitter.scale * row_sums.sum()
         self.tables.environment = self._add("envmap_bytes" if in_bytes else "envmap_floats", power, -1)
+
+    # --- lights without extent, and suns -----------------------------------------------------------------------------
+
+    def _point(self, emitter: description.Point | description.Spot) -> None:
+        record = tables.PointRecord()
+        intensity = _rgb(emitter.intensity)
+        record.position, record.intensity = wp.vec3(*emitter.position), wp.vec3(*intensity)
+        power = 4.0 * np.pi * _luminance(intensity)
+        if isinstance(emitter, description.Spot):
+            record.direction = wp.vec3(*_unit(emitter.direction))
+            outer = np.radians(emitter.cutoff_angle)
+            inner = 0.75 * outer if emitter.beam_width is None else np.radians(emitter.beam_width)
+            record.cutoff_angle, record.beam_width = outer, inner
+            # The full cone, and half of what lies around it: enough for a selection.
+            power *= 0.5 * (1.0 - 0.5 * (np.cos(inner) + np.cos(outer)))
+        self.points.append(record)
+        self._add("spot" if isinstance(emitter, description.Spot) else "point", power, len(self.points) - 1)
+
+    def _distant(self, kind: str, direction, one_minus_cos: float, emitted: np.ndarray, power: float) -> None:
+        """`power` is that of a luminance of 1 in `emitted`."""
+        record = tables.DistantRecord()
+        record.direction, record.emitted = wp.vec3(*-_unit(direction)), wp.vec3(*emitted)
+        record.one_minus_cos = one_minus_cos
+        self.distant.append(record)
+        self._add(kind, power * _luminance(emitted), len(self.distant) - 1)
+
+    def _sun(self, emitter: description.Sun, cross_section: float) -> None:
+        half = np.radians(0.5 * emitter.angle)
+        # Irradiance of a disc of radiance 1: the integral of the cosine over the cone, pi sin^2(angle).
+        projected = np.pi * np.sin(2.0 * half) ** 2
+        if emitter.radiance is not None:
+            radiance = _rgb(emitter.radiance)
+        else:
+            radiance = _rgb(1.0 if emitter.irradiance is None else emitter.irradiance) / projected
+        self._distant("sun", emitter.direction, 2.0 * np.sin(half) ** 2, radiance, cross_section * projected)
+
+
+def _unit(vector) -> np.ndarray:
+    return np.asarray(vector, np.float64) / np.linalg.norm(vector)
 
 
 def _load_envmap(file: str, where: str, notes: list[str]) -> np.ndarray:

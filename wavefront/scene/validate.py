@@ -74,6 +74,12 @@ def _find_warnings(scene):
         warnings.append("the scene has no shapes")
     if not scene.emitters and all(shape.emitter is None for shape in scene.shapes):
         warnings.append("the scene has no emitter: the image will be black")
+    for i, emitter in enumerate(scene.emitters if not scene.integrator.nee else ()):
+        if isinstance(emitter, (description.Directional, description.Point, description.Spot)):
+            kind = emitter.__struct_config__.tag
+            warnings.append(
+                f"emitters[{i}]: a {kind} light adds nothing where integrator.nee is false: no ray meets it"
+            )
     for kind in ("textures", "bsdfs"):
         for i, record in enumerate(getattr(scene, kind)):
             if not record.name:
@@ -168,6 +174,15 @@ def _check_emitters(scene):
             matrix = _check_transform(emitter.to_world, f"{path}.to_world")
             if matrix is not None and not _is_similarity(matrix):
                 _fail(f"{path}.to_world", "an environment can be rotated; found different scales or a shear")
+        direction = getattr(emitter, "direction", None)
+        if direction is not None and not np.linalg.norm(direction) > 0.0:
+            _fail(f"{path}.direction", "the direction is zero")
+        if isinstance(emitter, description.Spot):
+            if emitter.beam_width is not None and emitter.beam_width > emitter.cutoff_angle:
+                found = f"{emitter.beam_width:g} and {emitter.cutoff_angle:g}"
+                _fail(f"{path}.beam_width", f"expected at most cutoff_angle; found {found}")
+        if isinstance(emitter, description.Sun) and emitter.irradiance is not None and emitter.radiance is not None:
+            _fail(path, "a sun has irradiance or radiance; found both")
 
 
 # --- shapes ----------------------------------------------------------------------------------------------------
