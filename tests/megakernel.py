@@ -121,7 +121,8 @@ def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool, nee
                 break
             vertex = vertex_of(geometry, origin, direction, hit)
             shape = geometry.shapes[geometry.shape_of[hit.primitive]]
-            if shape.first_light >= 0 and wp.dot(vertex.geometric_normal, direction) < 0.0:
+            emits = wp.dot(vertex.geometric_normal, direction) < 0.0 or shape.two_sided == 1
+            if shape.first_light >= 0 and emits:
                 index = shape.first_light + hit.primitive - shape.first_primitive
                 emitter = lights.emitters[lights.lights[index].emitter]
                 w = float(1.0)

@@ -214,6 +214,14 @@ AROUND: dict[str, list[str]] = {
     "envmap, turned": [FLOOR, _BOX, _envmap("sky.exr", '<rotate x="1" angle="50"/><rotate y="1" angle="110"/>')],
     "envmap, mirrored": [FLOOR, _BOX, _envmap("sky.exr", '<rotate z="1" angle="35"/><scale x="-1"/>')],
     "envmap, 8 bit": [FLOOR, _BOX, _envmap("texture.png", '<rotate z="1" angle="35"/>')],
+    "textured lamp": [
+        FLOOR,
+        _BOX,
+        SKY,
+        f"""<shape type="rectangle">
+    <transform name="to_world"><scale x="1.5" y="0.8"/><rotate x="1" angle="110"/><translate y="2" z="-1"/></transform>
+    <emitter type="area">{_texture("radiance", raw=True)}</emitter></shape>""",
+    ],
     "envmap and lamp": [FLOOR, _BOX, LAMP, _envmap("sky.exr", "")],
 }
 
@@ -259,8 +267,8 @@ DELTA: dict[str, list[str]] = {
     ],
 }
 
-# A ball so far away that it is a disc of an angular radius of 8 degrees from everywhere in the scene.
-SUN_DIRECTION, SUN_ANGLE, SUN_RADIANCE = (0.6, -1.0, -0.3), 8.0, (40.0, 30.0, 20.0)
+# A ball so far away that it is a disc of an angular radius of 30 degrees from everywhere in the scene.
+SUN_DIRECTION, SUN_ANGLE, SUN_RADIANCE = (0.6, -1.0, -0.3), 30.0, (5.0, 4.0, 3.0)
 
 
 def far_ball() -> str:

@@ -146,6 +146,9 @@ def test_lights_from_afar_and_from_points(nee):
     """Two suns that overlap, and one of each light without extent, beside lamps and an environment."""
     scene = mixed_scene()
     scene.shapes = scene.shapes[:-1]
+    for shape in scene.shapes:
+        if shape.emitter is not None:
+            shape.emitter = d.Area(radiance=shape.emitter.radiance, two_sided=True)
     scene.emitters += [
         d.Sun(direction=(0.3, -1.0, -0.2), angle=20.0, radiance=[3.0, 2.0, 1.0]),
         d.Directional(direction=(-1.0, -1.0, 0.0), irradiance=0.5),

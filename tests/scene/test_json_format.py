@@ -319,7 +319,7 @@ def full_scene(folder):
             ),
             d.Rectangle(to_world=[step(look_at=d.LookAt(origin=(0.0, 0.0, 1.0), target=(1.0, 0.0, 0.0)))]),
             d.Cube(to_world=[step(scale=(1.0, 2.0, 3.0)), step(rotate=d.Rotate(axis=(0.0, 1.0, 0.0), angle=20.0))]),
-            d.Disk(emitter=d.Area(radiance="checks"), flip_normals=True, to_world=[step(matrix=rows)]),
+            d.Disk(emitter=d.Area(radiance="checks", two_sided=True), flip_normals=True, to_world=[step(matrix=rows)]),
             d.Sphere(center=(0.1, 0.2, 0.3), radius=2.0, bsdf=d.Diffuse(), to_world=[step(translate=(0.0, 0.0, 1.0))]),
         ],
     )

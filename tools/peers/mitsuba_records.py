@@ -120,6 +120,8 @@ class _Writer:
         where = f"shapes[{index}]"
         result = {"bsdf": self._bsdf(shape.bsdf)}
         if shape.emitter is not None:
+            if shape.emitter.two_sided:
+                raise WavefrontError(f"{where}: Mitsuba has no emission from both sides")
             result["emitter"] = {"type": "area", "radiance": self._parameter(shape.emitter.radiance)}
         if isinstance(shape, description.Mesh):
             # The triangles that we read ourselves: reading files is compared through Mitsuba's XML.

@@ -121,10 +121,13 @@ def make_light_sampler(kinds: tuple[str, ...], textures: tuple[str, ...]):
                 cross = wp.cross(v1 - v0, v2 - v0)
                 normal = wp.normalize(cross)
                 shading_normal = normal
-                if geometry.shapes[geometry.shape_of[light.primitive]].smooth == 1:
+                shape = geometry.shapes[geometry.shape_of[light.primitive]]
+                if shape.smooth == 1:
                     shading_normal = b[0] * geometry.normals[i0] + b[1] * geometry.normals[i1]
                     shading_normal += b2 * geometry.normals[i2]
                 if wp.dot(shading_normal, normal) < 0.0:
+                    normal = -normal
+                if shape.two_sided == 1 and wp.dot(normal, wi) > 0.0:
                     normal = -normal
                 # Emission is towards the front of the geometric normal; the density in area, 2 / |cross|, becomes one
                 # in solid angle by distance^2 / cos.
@@ -141,10 +144,13 @@ def make_light_sampler(kinds: tuple[str, ...], textures: tuple[str, ...]):
             if light.kind == KIND_SPHERE:
                 emitter = lights.emitters[light.emitter]
                 sphere = geometry.spheres[light.primitive - geometry.triangle_count]
-                inwards = geometry.shapes[geometry.shape_of[light.primitive]].flip == 1
+                shape = geometry.shapes[geometry.shape_of[light.primitive]]
                 center = wp.vec3(sphere[0], sphere[1], sphere[2])
                 r = sphere[3]
                 one_minus_cos = sphere_cone(sphere, p)
+                inwards = shape.flip == 1
+                if shape.two_sided == 1:
+                    inwards = one_minus_cos <= 0.0
                 normal = wp.vec3(0.0)
                 if one_minus_cos > 0.0:
                     to_center = center - p

@@ -191,9 +191,10 @@ Bsdf = Diffuse | Conductor | RoughConductor | Dielectric | RoughDielectric | Two
 
 
 class Area(Record, tag_field="type", tag="area"):
-    """Diffuse emission from the front of a shape."""
+    """Diffuse emission from the front of a shape, or from both sides."""
 
     radiance: Annotated[Radiance, Meta(description="W / (m^2 sr)")] = 1.0
+    two_sided: Annotated[bool, Meta(description="The back emits as the front does.")] = False
 
 
 class Constant(Record, tag_field="type", tag="constant"):

@@ -268,6 +268,7 @@ class _Upload:
             where = f"shapes[{i}]"
             emitter = self._emitter(shape.emitter, where) if shape.emitter is not None else -1
             record = {"material": self._material(shape.bsdf, f"{where}.bsdf"), "first_light": -1}
+            record["two_sided"] = int(shape.emitter is not None and shape.emitter.two_sided)
             if isinstance(shape, description.Sphere):
                 matrix = to_matrix(shape.to_world, f"{where}.to_world")
                 center = matrix[:3, :3] @ np.asarray(shape.center) + matrix[:3, 3]

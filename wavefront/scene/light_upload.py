@@ -53,11 +53,11 @@ class LightUpload:
                 a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.float64) for i in range(3))
                 areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
                 primitives = record["first_primitive"] + np.arange(len(areas))
-                power = areas * np.pi * self.luminances[emitter]
+                power = areas * np.pi * self.luminances[emitter] * (1 + record["two_sided"])
                 record["first_light"] = self._add("triangle", power, emitter, primitives)
         for record, _, radius, emitter, *_ in spheres:
             if emitter >= 0:
-                power = 4.0 * np.pi * radius**2 * np.pi * self.luminances[emitter]
+                power = 4.0 * np.pi * radius**2 * np.pi * self.luminances[emitter] * (1 + record["two_sided"])
                 record["first_light"] = self._add("sphere", power, emitter, record["first_primitive"])
         # What comes from afar has the power that enters the bounding sphere of the scene.
         cross_section = np.pi * (0.5 * float(np.linalg.norm(bounds[1] - bounds[0])) or 1.0) ** 2

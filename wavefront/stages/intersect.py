@@ -53,7 +53,8 @@ def make_intersect(triangles: bool, spheres: bool, smooth: bool, uvs: bool, area
             surfaces.uv[slot] = vertex.uv
         if wp.static(area_lights):
             light = int(-1)
-            if shape.first_light >= 0 and wp.dot(vertex.geometric_normal, direction) < 0.0:
+            front = wp.dot(vertex.geometric_normal, direction) < 0.0
+            if shape.first_light >= 0 and (front or shape.two_sided == 1):
                 light = shape.first_light + hit.primitive - shape.first_primitive
                 push(emissive, slot, counters)
             surfaces.light[slot] = light
