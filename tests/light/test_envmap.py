@@ -335,7 +335,7 @@ def test_a_file_of_radiance_hdr(folder):
     step = 2.0 ** (pixels[:, :, 3:].astype(float) - 136)
     assert (np.abs(read - expected) <= step).all()
     (folder / "bad.hdr").write_bytes(b"not one")
-    with pytest.raises(SceneError, match="bad.hdr: cannot be read"):
+    with pytest.raises(SceneError, match=r"bad\.hdr: cannot be read"):
         load_image(folder / "bad.hdr")
 
 

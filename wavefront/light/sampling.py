@@ -34,7 +34,6 @@ from wavefront.warp_samples import (
     to_world,
 )
 
-
 # A shadow ray ends short of its light by some roundings of the distance: the ray-triangle test is no better than that.
 SHADOW_END = wp.constant(1.0 - 2.0**-16)
 

@@ -48,8 +48,8 @@ def load_image(path: str | os.PathLike, where: str = "") -> np.ndarray:
     """Pixels of an image file, first row on top, as encoded (no colour conversion).
 
     8-bit images give uint8; OpenEXR, Radiance HDR and 16-bit grey PNG give float32 (16-bit scaled to [0, 1]). Alpha is
-    dropped (colours are not premultiplied by it), palettes are expanded, CMYK and other modes become RGB. Pillow reads 16-bit
-    colour PNG with 8 bits.
+    dropped (colours are not premultiplied by it), palettes are expanded, CMYK and other modes become RGB. Pillow
+    reads 16-bit colour PNG with 8 bits.
 
     Args:
         path: The file.

@@ -13,7 +13,6 @@ from wavefront.scene import description
 from wavefront.scene.images import replacing
 from wavefront.scene.transforms import is_mirror, to_matrix
 
-
 DISK_SEGMENTS = 256
 
 
