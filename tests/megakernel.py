@@ -18,9 +18,10 @@ from wavefront.bsdf.dispatch import is_smooth, make_bsdf
 from wavefront.bsdf.tables import KINDS as BSDF_KINDS
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.camera import Camera, camera_ray, make_camera
+from wavefront.light.envmap import make_envmap
 from wavefront.light.sampling import make_light_sampler
+from wavefront.light.tables import KIND_CONSTANT, KIND_ENVMAP_FLOATS, LightTables
 from wavefront.light.tables import KINDS as LIGHT_KINDS
-from wavefront.light.tables import LightTables
 from wavefront.renderer import Renderer
 from wavefront.rng import PURPOSE_BSDF, PURPOSE_CAMERA, PURPOSE_LIGHT, uniform4
 from wavefront.surface import make_vertex, spawn_origin
@@ -28,6 +29,7 @@ from wavefront.texture import TextureTables, make_eval_parameter
 from wavefront.warp_samples import square_to_gaussian, square_to_tent
 
 TEXTURES = ("bytes", "checkerboard", "floats")
+LIGHTS = tuple(sorted(set(LIGHT_KINDS) - {"envmap_bytes"}))  # of environment maps, those of floats
 BOX, TENT, GAUSSIAN = wp.constant(0), wp.constant(1), wp.constant(2)
 FILTERS = {"box": 0, "tent": 1, "gaussian": 2}
 
@@ -46,12 +48,13 @@ class Settings:
 
 
 @functools.cache
-def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
-    """Only what a scene lacks memory for is left out: kinds of primitive, vertex normals and UVs."""
+def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool, nee: bool):
+    """Only what a scene lacks memory for is left out: kinds of primitive, vertex normals, UVs, tables of sampling."""
     closest_hit, occluded = make_intersector(triangles, spheres)
     vertex_of = make_vertex(triangles, spheres, smooth, uvs)
     eval_bsdf, sample_bsdf, _ = make_bsdf(tuple(sorted(BSDF_KINDS)), True, TEXTURES)
-    sample_light, light_pdf = make_light_sampler(tuple(sorted(LIGHT_KINDS)), TEXTURES)
+    sample_light, light_pdf = make_light_sampler(LIGHTS, TEXTURES)
+    eval_envmap, _ = make_envmap(False, nee)
     eval_parameter = make_eval_parameter(TEXTURES)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -91,16 +94,35 @@ def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
             if hit.primitive < 0:
                 if lights.environment >= 0:
                     sky = lights.lights[lights.environment]
+                    Le = wp.vec3(0.0)
+                    b = float(0.0)
+                    if sky.kind == KIND_CONSTANT:
+                        Le = lights.emitters[sky.emitter].radiance
+                        b = sky.pmf / wp.static(4.0 * wp.pi)
+                    if sky.kind == KIND_ENVMAP_FLOATS:
+                        found = eval_envmap(lights.envmap, direction)
+                        Le = found.L
+                        b = sky.pmf * found.pdf
                     w = float(1.0)
                     if settings.nee == 1 and bsdf_pdf > 0.0:
                         a = bsdf_pdf
-                        b = sky.pmf / wp.static(4.0 * wp.pi)
                         w = a * a / (a * a + b * b)
-                    L += w * wp.cw_mul(beta, lights.emitters[sky.emitter].radiance)
+                    L += w * wp.cw_mul(beta, Le)
+                for k in range(lights.sun_count):
+                    index = lights.first_sun + k
+                    disc = lights.distant[lights.lights[index].emitter]
+                    if wp.length_sq(direction - disc.direction) <= 2.0 * disc.one_minus_cos:
+                        w = float(1.0)
+                        if settings.nee == 1 and bsdf_pdf > 0.0:
+                            b = lights.lights[index].pmf / (wp.static(2.0 * wp.pi) * disc.one_minus_cos)
+                            ratio = b / bsdf_pdf
+                            w = 1.0 / (1.0 + ratio * ratio)
+                        L += w * wp.cw_mul(beta, disc.emitted)
                 break
             vertex = vertex_of(geometry, origin, direction, hit)
             shape = geometry.shapes[geometry.shape_of[hit.primitive]]
-            if shape.first_light >= 0 and wp.dot(vertex.geometric_normal, direction) < 0.0:
+            emits = wp.dot(vertex.geometric_normal, direction) < 0.0 or shape.two_sided == 1
+            if shape.first_light >= 0 and emits:
                 index = shape.first_light + hit.primitive - shape.first_primitive
                 emitter = lights.emitters[lights.lights[index].emitter]
                 w = float(1.0)
@@ -129,6 +151,8 @@ def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
                         if not occluded(geometry, start, to_light, light.t_max):
                             ratio = f.pdf / light.pdf
                             w = 1.0 / (1.0 + ratio * ratio)
+                            if light.delta == 1:
+                                w = 1.0
                             L += (w / light.pdf) * wp.cw_mul(beta, wp.cw_mul(f.value, light.L))
 
             u = uniform4(seed, key, sample, segment - 1, PURPOSE_BSDF)
@@ -164,7 +188,7 @@ def render_megakernel(renderer: Renderer, spp: int) -> np.ndarray:
     settings.seed = renderer.seed
     n = film.width * film.height * spp
     result = wp.zeros(n, dtype=wp.vec3, device="cpu")
-    kernel = make_megakernel(f.triangles, f.spheres, f.smooth, f.uvs)
+    kernel = make_megakernel(f.triangles, f.spheres, f.smooth, f.uvs, f.nee)
     d = device_scene
     inputs = [make_camera(scene.camera, film), d.geometry, d.materials, d.textures, d.lights, settings]
     wp.launch(kernel, dim=n, inputs=inputs, outputs=[result], device="cpu")

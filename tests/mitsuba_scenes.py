@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from wavefront.scene.images import write_exr
+
 SIZE = 32  # pixels of a side
 MAX_DEPTH = 5
 
@@ -234,6 +236,88 @@ MIXED: dict[str, list[str]] = {
     ],
 }
 
+_BOX = f"""<shape type="cube"><transform name="to_world"><scale value="0.6"/><rotate y="1" angle="30"/>
+    <translate x="0.2" y="0.6"/></transform>{_PAINT.format("0.7, 0.7, 0.2")}</shape>"""
+
+
+def _envmap(file: str, rotate: str) -> str:
+    return f"""<emitter type="envmap"><string name="filename" value="{file}"/><float name="scale" value="1.5"/>
+    <transform name="to_world">{rotate}</transform></emitter>"""
+
+
+# Emitters that rays find which hit nothing, so that a render without light sampling sees them too.
+AROUND: dict[str, list[str]] = {
+    "envmap": [FLOOR, _BOX, _envmap("sky.exr", "")],
+    "envmap, turned": [FLOOR, _BOX, _envmap("sky.exr", '<rotate x="1" angle="50"/><rotate y="1" angle="110"/>')],
+    "envmap, mirrored": [FLOOR, _BOX, _envmap("sky.exr", '<rotate z="1" angle="35"/><scale x="-1"/>')],
+    "envmap, 8 bit": [FLOOR, _BOX, _envmap("texture.png", '<rotate z="1" angle="35"/>')],
+    "textured lamp": [
+        FLOOR,
+        _BOX,
+        SKY,
+        f"""<shape type="rectangle">
+    <transform name="to_world"><scale x="1.5" y="0.8"/><rotate x="1" angle="110"/><translate y="2" z="-1"/></transform>
+    <emitter type="area">{_texture("radiance", raw=True)}</emitter></shape>""",
+    ],
+    "envmap and lamp": [FLOOR, _BOX, LAMP, _envmap("sky.exr", "")],
+}
+
+_SPOT = """<emitter type="spot"><transform name="to_world"><lookat origin="1, 4, 2" target="0, 0.3, 0" up="0, 1, 0"/>
+    </transform><rgb name="intensity" value="50, 40, 30"/>{}</emitter>"""
+_POINT = """<emitter type="point"><point name="position" x="-1.5" y="2" z="1"/>
+    <rgb name="intensity" value="6, 7, 9"/></emitter>"""
+
+# Emitters that only light sampling finds.
+DELTA: dict[str, list[str]] = {
+    "point": [FLOOR, _BOX, _POINT],
+    "spot": [FLOOR, _BOX, _SPOT.format("")],
+    "spot, even": [
+        FLOOR,
+        _BOX,
+        _SPOT.format('<float name="cutoff_angle" value="25"/><float name="beam_width" value="25"/>'),
+    ],
+    "spot, wide": [
+        FLOOR,
+        _BOX,
+        _SPOT.format('<float name="cutoff_angle" value="120"/><float name="beam_width" value="10"/>'),
+    ],
+    "directional": [
+        FLOOR,
+        _BOX,
+        """<emitter type="directional"><vector name="direction" x="1" y="-2" z="-0.5"/>
+    <rgb name="irradiance" value="3, 2.5, 2"/></emitter>""",
+    ],
+    "directional, turned": [
+        FLOOR,
+        _BOX,
+        """<emitter type="directional"><transform name="to_world"><rotate x="1" angle="60"/><rotate y="1" angle="30"/>
+    </transform></emitter>""",
+    ],
+    "all of them": [
+        FLOOR,
+        _BOX,
+        LAMP,
+        SKY,
+        _SPOT.format(""),
+        _POINT,
+        '<emitter type="directional"><vector name="direction" x="0.3" y="-1" z="0"/></emitter>',
+    ],
+}
+
+# A ball so far away that it is a disc of an angular radius of 30 degrees from everywhere in the scene.
+SUN_DIRECTION, SUN_ANGLE, SUN_RADIANCE = (0.6, -1.0, -0.3), 30.0, (5.0, 4.0, 3.0)
+
+
+def far_ball() -> str:
+    axis, distance = np.array(SUN_DIRECTION) / np.linalg.norm(SUN_DIRECTION), 1e5
+    x, y, z = -distance * axis
+    return f"""<shape type="sphere"><point name="center" x="{x}" y="{y}" z="{z}"/>
+    <float name="radius" value="{distance * np.sin(np.radians(SUN_ANGLE))}"/><emitter type="area">
+    <rgb name="radiance" value="{SUN_RADIANCE[0]}, {SUN_RADIANCE[1]}, {SUN_RADIANCE[2]}"/></emitter></shape>"""
+
+
+SUN = [FLOOR, _BOX, far_ball()]
+
 # Elements of the sensor, and the size of the film.
 CAMERAS: dict[str, tuple[str, tuple[int, int]]] = {
     axis: (f'<string name="fov_axis" value="{axis}"/>', size)
@@ -249,6 +333,9 @@ def write_files(folder: Path) -> None:
     texture = rng.integers(20, 250, (5, 7, 3), dtype=np.uint8)
     Image.fromarray(texture).save(folder / "texture.png")
     Image.fromarray(rng.integers(0, 255, (4, 6), dtype=np.uint8)).save(folder / "opacity.png")
+    sky = np.exp(rng.normal(size=(6, 10, 3))).astype(np.float32)
+    sky[2, 3] = (20.0, 16.0, 8.0)
+    write_exr(folder / "sky.exr", {name: sky[:, :, i] for i, name in enumerate("RGB")})
     (folder / "ball.obj").write_text(_ball_obj(8, 12), encoding="utf-8")
 
 

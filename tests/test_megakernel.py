@@ -14,6 +14,7 @@ import pytest
 from tests.megakernel import render_megakernel
 from wavefront import Renderer, load_scene
 from wavefront.scene import description as d
+from wavefront.scene.images import write_exr
 
 SCENES = Path(__file__).parent.parent / "scenes"
 SPP = 4
@@ -125,6 +126,36 @@ def mixed_scene():
 @pytest.mark.parametrize("nee", [True, False])
 def test_mixed_scene(nee):
     scene = mixed_scene()
+    scene.integrator.nee = nee
+    check(scene, spp=8)
+
+
+@pytest.mark.parametrize("nee", [True, False])
+def test_environment_map(tmp_path, nee):
+    pixels = np.exp(np.random.default_rng(1).normal(size=(6, 10, 3))).astype(np.float32)
+    write_exr(tmp_path / "sky.exr", {name: pixels[:, :, i] for i, name in enumerate("RGB")})
+    scene = mixed_scene()
+    scene.shapes = scene.shapes[:-1]  # but the sphere around everything
+    scene.emitters = [d.Envmap(file=str(tmp_path / "sky.exr"), scale=0.7)]
+    scene.integrator.nee = nee
+    check(scene, spp=8)
+
+
+@pytest.mark.parametrize("nee", [True, False])
+def test_lights_from_afar_and_from_points(nee):
+    """Two suns that overlap, and one of each light without extent, beside lamps and an environment."""
+    scene = mixed_scene()
+    scene.shapes = scene.shapes[:-1]
+    for shape in scene.shapes:
+        if shape.emitter is not None:
+            shape.emitter = d.Area(radiance=shape.emitter.radiance, two_sided=True)
+    scene.emitters += [
+        d.Sun(direction=(0.3, -1.0, -0.2), angle=20.0, radiance=[3.0, 2.0, 1.0]),
+        d.Directional(direction=(-1.0, -1.0, 0.0), irradiance=0.5),
+        d.Point(position=(0.5, 2.0, 2.0), intensity=[0.5, 0.7, 0.9]),
+        d.Sun(direction=(0.5, -1.0, -0.2), angle=10.0, irradiance=0.5),
+        d.Spot(position=(0.0, 3.0, 0.0), direction=(0.0, -1.0, 0.1), intensity=3.0),
+    ]
     scene.integrator.nee = nee
     check(scene, spp=8)
 

@@ -114,6 +114,31 @@ def test_mixed(folder, name):
     check_small(folder, name, scenes.document(scenes.MIXED[name], everything=True))
 
 
+@pytest.mark.parametrize("nee", [True, False])
+@pytest.mark.parametrize("name", scenes.AROUND)
+def test_around(folder, name, nee):
+    check_small(folder, name, scenes.document(scenes.AROUND[name], everything=False), nee=nee)
+
+
+@pytest.mark.parametrize("name", scenes.DELTA)
+def test_delta(folder, name):
+    check_small(folder, name, scenes.document(scenes.DELTA[name], everything=False))
+
+
+@pytest.mark.parametrize("nee", [True, False])
+def test_sun(folder, nee):
+    """Against a ball far away; from within 5 m its disc is the same to 5e-5 of its size and direction."""
+    path = folder / "scene.xml"
+    path.write_text(scenes.document(scenes.SUN, everything=False), encoding="utf-8")
+    size = (scenes.SIZE, scenes.SIZE)
+    scene = read(path, *size, scenes.MAX_DEPTH, nee)
+    scene.shapes = [shape for shape in scene.shapes if shape.emitter is None]
+    sun = description.Sun(direction=scenes.SUN_DIRECTION, angle=scenes.SUN_ANGLE, radiance=list(scenes.SUN_RADIANCE))
+    scene.emitters = [sun]
+    theirs = their_batches(peer.load_xml(path, *size), scenes.MAX_DEPTH, SPP)
+    report("sun", compare(our_batches(scene, SPP), theirs, TILES))
+
+
 @pytest.mark.parametrize("axis", scenes.CAMERAS)
 def test_camera(folder, axis):
     camera, size = scenes.CAMERAS[axis]

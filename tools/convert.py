@@ -72,7 +72,7 @@ def _copy_textures(scene, folder, final):
     copied: dict[str, Path] = {}
     taken: set[str] = set()
     for path, record in walk(scene):
-        if not isinstance(record, description.Bitmap):
+        if not isinstance(record, (description.Bitmap, description.Envmap)):
             continue
         if record.file not in copied:
             folder.mkdir(exist_ok=True)

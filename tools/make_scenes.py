@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from tools import door_scene
+from tools import door_scene, light_scenes
 from tools.scene_parts import box, film, look_at, place, rectangle, revolve, write_ply
 from wavefront.scene import json_format
 from wavefront.scene.description import (
@@ -63,6 +63,8 @@ def write(folder: Path) -> list[str]:
     write_ply(folder / names[0], *revolve(_bowl_profile(), 32))
     write_ply(folder / names[1], *revolve(door_scene.vase_profile(), 24))
     Image.fromarray(tiles()).save(folder / names[2], optimize=True)
+    names.append("textures/sky.exr")
+    light_scenes.write_sky(folder / names[3])
     scenes = {
         "cornell-box.json": cornell_box(),
         "furnace.json": furnace(),
@@ -70,6 +72,7 @@ def write(folder: Path) -> list[str]:
         "glass-caustic.json": glass_caustic(),
         "door-ajar.json": door_scene.door_ajar(folder),
         "include/material-stage.json": material_stage(),
+        **{f"light-{name}.json": scene for name, scene in light_scenes.scenes(folder).items()},
         **{f"material-{name}.json": scene for name, scene in material_balls(folder).items()},
     }
     for name, scene in scenes.items():

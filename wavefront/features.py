@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 
 from wavefront.bsdf.tables import DELTA
+from wavefront.light import tables
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,12 +46,13 @@ class Features:
         return any(kind not in DELTA for kind in self.bsdfs)
 
     @property
-    def environment(self) -> bool:
-        return "constant" in self.lights
+    def escape_lights(self) -> tuple[str, ...]:
+        """Kinds of light that a ray finds which hits nothing."""
+        return tuple(kind for kind in self.lights if kind in (*tables.ENVIRONMENT, "sun"))
 
     @property
     def area_lights(self) -> bool:
-        return "triangle" in self.lights or "sphere" in self.lights
+        return any(kind in tables.AREA for kind in self.lights)
 
     @property
     def light_sampling(self) -> bool:

@@ -88,8 +88,8 @@ def make_kernels(f: Features) -> Kernels:
     """Kernels for a set of features; scenes that agree in what a stage reads share its kernel."""
     return Kernels(
         generate=make_generate(f.filter, f.transmission),
-        intersect=make_intersect(f.triangles, f.spheres, f.smooth, f.uvs, f.area_lights, f.environment),
-        escaped=make_escaped(f.light_sampling) if f.environment else None,
+        intersect=make_intersect(f.triangles, f.spheres, f.smooth, f.uvs, f.area_lights, bool(f.escape_lights)),
+        escaped=make_escaped(f.escape_lights, f.light_sampling) if f.escape_lights else None,
         emission=make_emission(f.lights, f.light_textures, f.light_sampling) if f.area_lights else None,
         aov=make_aov(f.aovs, f.bsdfs, f.mask, f.textures, f.uvs) if f.aovs else None,
         direct=make_direct(f.bsdfs, f.mask, f.textures, f.lights, f.light_textures, f.uvs)
@@ -114,7 +114,7 @@ def skipped_arrays(f: Features) -> dict[type, tuple[str, ...]]:
 
 def queue_names(f: Features) -> tuple[str, ...]:
     """Queues that the features need."""
-    needed = {"escaped": f.environment, "emissive": f.area_lights, "shadow": f.light_sampling}
+    needed = {"escaped": bool(f.escape_lights), "emissive": f.area_lights, "shadow": f.light_sampling}
     return ("rays", "hits", *(name for name, used in needed.items() if used))
 
 

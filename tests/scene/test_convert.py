@@ -22,6 +22,7 @@ SCENE = """<scene version="3.0.0">
 <shape type="obj"><string name="filename" value="a/mesh.obj"/><boolean name="face_normals" value="true"/></shape>
 <shape type="obj"><string name="filename" value="a/mesh.obj"/><ref id="board"/></shape>
 <shape type="sphere"><emitter type="area"/></shape>
+<emitter type="envmap"><string name="filename" value="a/t.png"/><float name="scale" value="2"/></emitter>
 </scene>
 """
 
@@ -49,6 +50,7 @@ def test_converted_scene_is_the_same_scene(scene_file, tmp_path, capsys):
     assert second.integrator == first.integrator
     assert second.camera == first.camera
     assert [bsdf.name for bsdf in second.bsdfs] == ["board"]
+    assert second.emitters == [d.Envmap(file=str(out.parent / "room_textures" / "t.png"), scale=2.0)]
     assert len(second.shapes) == len(first.shapes)
     for before, after in zip(first.shapes, second.shapes, strict=True):
         assert (after.bsdf, after.emitter) == (before.bsdf, before.emitter)

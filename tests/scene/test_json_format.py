@@ -164,7 +164,7 @@ def test_a_byte_order_mark_is_stepped_over(write):
 
 
 def test_a_type_that_stands_alone_can_be_left_out(write):
-    scene = json_format.load(write({"camera": {"fov": 30}, "emitters": [{"radiance": 2}]}))
+    scene = json_format.load(write({"camera": {"fov": 30}, "emitters": [{"type": "constant", "radiance": 2}]}))
     assert scene.camera == d.Perspective(fov=30.0)
     assert scene.emitters == [d.Constant(radiance=2.0)]
 
@@ -300,7 +300,18 @@ def full_scene(folder):
             d.TwoSided(name="f", front="a", back=d.Diffuse(reflectance=0.25)),
             d.Mask(name="g", bsdf="f", opacity="checks"),
         ],
-        emitters=[d.Constant(name="sky", radiance=[0.0, 1.0, 1e8])],
+        emitters=[
+            d.Envmap(
+                name="sky",
+                file=str(folder / "t.exr"),
+                scale=0.5,
+                to_world=[step(rotate=d.Rotate(axis=(1.0, 0.0, 0.0), angle=9.0))],
+            ),
+            d.Directional(name="d", direction=(0.0, -1.0, 0.5), irradiance=2.0),
+            d.Point(name="p", position=(0.0, 1.0, 0.5), intensity=[1.0, 0.0, 1e8]),
+            d.Spot(position=(0.0, 1.0, 0.5), direction=(0.0, 0.0, 2.0), cutoff_angle=180.0, beam_width=0.0),
+            d.Sun(direction=(1.0, 1.0, 0.5), angle=0.5, radiance=[1.0, 2.0, 3.0]),
+        ],
         shapes=[
             d.Mesh(name="m", file=str(folder / "m.ply"), flip_v=True, bsdf="g"),
             d.Mesh(
@@ -311,7 +322,7 @@ def full_scene(folder):
             ),
             d.Rectangle(to_world=[step(look_at=d.LookAt(origin=(0.0, 0.0, 1.0), target=(1.0, 0.0, 0.0)))]),
             d.Cube(to_world=[step(scale=(1.0, 2.0, 3.0)), step(rotate=d.Rotate(axis=(0.0, 1.0, 0.0), angle=20.0))]),
-            d.Disk(emitter=d.Area(radiance="checks"), flip_normals=True, to_world=[step(matrix=rows)]),
+            d.Disk(emitter=d.Area(radiance="checks", two_sided=True), flip_normals=True, to_world=[step(matrix=rows)]),
             d.Sphere(center=(0.1, 0.2, 0.3), radius=2.0, bsdf=d.Diffuse(), to_world=[step(translate=(0.0, 0.0, 1.0))]),
         ],
     )
@@ -409,7 +420,7 @@ def test_the_schema_allows_what_is_written_and_refuses_what_is_refused(tmp_path)
     json.dumps(schema)
     raw = json.loads(json_format.dumps(full_scene(tmp_path), tmp_path))
     assert fits(raw, schema, definitions)
-    assert fits({"camera": {"fov": 3}, "emitters": [{}]}, schema, definitions)
+    assert fits({"camera": {"fov": 3}, "shapes": [{"type": "cube", "emitter": {}}]}, schema, definitions)
     for wrong in (
         {"camera": {"fov": 180}},
         {"shapes": [{}]},

@@ -28,6 +28,10 @@ def path(body):
     return f'<integrator type="path">\n{body}</integrator>'
 
 
+def envmap(body):
+    return f'<emitter type="envmap"><string name="filename" value="colours.png"/>{body}</emitter>'
+
+
 ERRORS = [
     ('\n\n<shape type="cylinder"/>', 4, "shape 'cylinder' is not supported; supported: obj, ply, rectangle"),
     ('<shape type="serialized"/>', 2, "shape 'serialized' is not supported"),
@@ -38,7 +42,20 @@ ERRORS = [
     (bsdf("plastic", '<rgb name="diffuse_reflectance" value="1 2 1"/>'), 2, "must be from 0 to 1"),
     (bsdf("roughdiffuse", '<texture name="alpha" type="checkerboard"/>'), 2, "needs a number alpha"),
     (bsdf("bumpmap"), 2, "bsdf 'bumpmap' is not supported yet"),
-    ('<emitter type="point"/>', 2, "emitter 'point' is not supported; supported: area, constant"),
+    ('<emitter type="projector"/>', 2, "emitter 'projector' is not supported; supported: area, constant, envmap"),
+    ('<emitter type="spot">\n<float name="cutoff_angle" value="0"/></emitter>', 3, "above 0 and at most 180; found 0"),
+    ('<emitter type="spot">\n<float name="beam_width" value="21"/></emitter>', 3, "from 0 to cutoff_angle; found 21"),
+    ('<emitter type="spot"><texture type="checkerboard"/></emitter>', 2, "cannot hold a texture"),
+    ('<emitter type="directional">\n<vector name="direction" x="0"/></emitter>', 3, "the direction is zero"),
+    (
+        '<emitter type="point"><point name="position" x="0"/><transform name="to_world"/></emitter>',
+        2,
+        "either position or to_world",
+    ),
+    ('<emitter type="envmap"/>', 2, "emitter 'envmap' needs a filename"),
+    (envmap('\n<float name="scale" value="-1"/>'), 3, "scale must be at least 0; found -1"),
+    (envmap('\n<transform name="to_world"><scale x="2"/></transform>'), 3, "an environment map can be rotated"),
+    (envmap('<string name="filename" value="no.exr"/>'.replace("filename", "other")), 2, "no property 'other'"),
     ('<emitter type="area"/>', 2, "belongs inside a shape"),
     (on_shape('<emitter type="spot"/>'), 2, "emitter 'spot' is not supported inside a shape"),
     ('<integrator type="aov"/>', 2, "integrator 'aov' is not supported"),

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 
 from wavefront.errors import SceneError
 from wavefront.scene import description as d
 from wavefront.scene import mesh_files
-from wavefront.scene.lookup import resolve_bsdf, resolve_texture, walk
+from wavefront.scene.lookup import resolve_bsdf, resolve_texture, shown, walk
 from wavefront.scene.validate import MESH_SUFFIXES, validate
 
 STEP = d.TransformStep
+TILES = str(Path(__file__).parents[2] / "scenes" / "textures" / "tiles.png")
 STEPS = "translate, rotate, scale, look_at, matrix"
 REFLECTING = "diffuse, oren_nayar, conductor, rough_conductor, plastic, rough_plastic"
 TOO_LARGE = "expected a number of at most 3.403e+38, as 32-bit floats are; found"
@@ -175,7 +177,7 @@ def moved(*transform, shape=d.Rectangle):
         (d.Scene(shapes=[d.Mesh(file="/none/a.ply")]), "shapes[0].file: file not found: '/none/a.ply'"),
         (
             d.Scene(textures=[d.Bitmap(file="/none/a.tif")]),
-            "textures[0].file: unknown image format '.tif' of '/none/a.tif'; allowed: .png, .jpg, .jpeg, .exr",
+            "textures[0].file: unknown image format '.tif' of '/none/a.tif'; allowed: .png, .jpg, .jpeg, .exr, .hdr",
         ),
         (
             with_bsdfs(d.Diffuse(reflectance=d.Bitmap(file="/none/a.png"))),
@@ -184,7 +186,32 @@ def moved(*transform, shape=d.Rectangle):
         # The rest
         (
             d.Scene(emitters=[d.Constant(), d.Constant()]),
-            "emitters[1]: a scene has at most one constant environment; found 2",
+            "emitters[1]: a scene has at most one environment; emitters[0] is one already",
+        ),
+        (
+            d.Scene(emitters=[d.Constant(), d.Sun(direction=(0.0, 0.0, 0.0))]),
+            "emitters[1].direction: the direction is zero",
+        ),
+        (
+            d.Scene(emitters=[d.Sun(direction=(0.0, 1.0, 0.0), radiance=1.0, irradiance=1.0)]),
+            "emitters[0]: a sun has irradiance or radiance; found both",
+        ),
+        (
+            d.Scene(emitters=[d.Spot(position=(0.0, 0.0, 0.0), direction=(0.0, 1.0, 0.0), beam_width=21.0)]),
+            "emitters[0].beam_width: expected at most cutoff_angle; found 21 and 20",
+        ),
+        (
+            d.Scene(emitters=[d.Envmap(file="/none/sky.png")]),
+            "emitters[0].file: file not found: '/none/sky.png'",
+        ),
+        (
+            d.Scene(emitters=[d.Envmap(file=__file__)]),
+            f"emitters[0].file: unknown image format '.py' of {shown(__file__)}; "
+            "allowed: .png, .jpg, .jpeg, .exr, .hdr",
+        ),
+        (
+            d.Scene(emitters=[d.Envmap(file=TILES, to_world=[d.TransformStep(scale=(1.0, 2.0, 1.0))])]),
+            "emitters[0].to_world: an environment can be rotated; found different scales or a shear",
         ),
         (d.Scene(film=d.Film(aovs=["depth", "depth"])), "film.aovs[1]: 'depth' is given twice"),
     ],
@@ -204,6 +231,21 @@ def test_unknown_indices_of_refraction_are_refused():
 def test_the_name_of_a_texture_of_roughness_is_checked():
     with pytest.raises(SceneError, match="bsdfs\\[0\\].roughness: unknown texture 'clay'"):
         validate(with_bsdfs(d.OrenNayar(roughness="clay")))
+
+
+@pytest.mark.parametrize("nee", [True, False])
+def test_a_light_that_no_ray_meets_is_a_warning_without_light_sampling(nee):
+    lights = [
+        d.Directional(direction=(0.0, -1.0, 0.0)),
+        d.Constant(),
+        d.Point(position=(0.0, 1.0, 0.0)),
+        d.Spot(position=(0.0, 1.0, 0.0), direction=(0.0, -1.0, 0.0)),
+        d.Sun(direction=(0.0, -1.0, 0.0)),
+    ]
+    scene = d.Scene(shapes=[d.Cube()], emitters=lights, integrator=d.PathIntegrator(nee=nee))
+    kinds = {} if nee else {0: "directional", 2: "point", 3: "spot"}
+    text = "emitters[{}]: a {} light adds nothing where integrator.nee is false: no ray meets it"
+    assert validate(scene) == [text.format(i, kind) for i, kind in kinds.items()]
 
 
 def test_unknown_metals_are_named_with_the_nearest():

@@ -50,7 +50,7 @@ class _Writer:
             "sensor": self._camera(),
         }
         for i, emitter in enumerate(self.scene.emitters):
-            result[f"emitter_{i}"] = {"type": "constant", "radiance": _colour(emitter.radiance)}
+            result[f"emitter_{i}"] = self._emitter(emitter, f"emitters[{i}]")
         for i, shape in enumerate(self.scene.shapes):
             result[f"shape_{i}"] = self._shape(i, shape)
         return result
@@ -81,12 +81,47 @@ class _Writer:
     def _transform(self, matrix):
         return self.mi.ScalarTransform4f(np.asarray(matrix, np.float64).tolist())
 
+    # --- emitters ------------------------------------------------------------------------------------------------
+
+    def _emitter(self, emitter, where):
+        if isinstance(emitter, description.Constant):
+            return {"type": "constant", "radiance": _colour(emitter.radiance)}
+        if isinstance(emitter, description.Directional):
+            return {
+                "type": "directional",
+                "direction": list(emitter.direction),
+                "irradiance": _colour(emitter.irradiance),
+            }
+        if isinstance(emitter, description.Point):
+            return {"type": "point", "position": list(emitter.position), "intensity": _colour(emitter.intensity)}
+        if isinstance(emitter, description.Spot):
+            target = np.add(emitter.position, emitter.direction)
+            up = np.eye(3)[int(np.argmin(np.abs(emitter.direction)))]
+            beam = 0.75 * emitter.cutoff_angle if emitter.beam_width is None else emitter.beam_width
+            return {
+                "type": "spot",
+                "to_world": self.mi.ScalarTransform4f().look_at(list(emitter.position), target.tolist(), up.tolist()),
+                "intensity": _colour(emitter.intensity),
+                "cutoff_angle": emitter.cutoff_angle,
+                "beam_width": beam,
+            }
+        if isinstance(emitter, description.Sun):
+            raise WavefrontError(f"{where}: Mitsuba has no sun that is a disc alone")
+        return {
+            "type": "envmap",
+            "filename": emitter.file,
+            "scale": emitter.scale,
+            "to_world": self._transform(to_matrix(emitter.to_world, f"{where}.to_world")),
+        }
+
     # --- shapes --------------------------------------------------------------------------------------------------
 
     def _shape(self, index, shape):
         where = f"shapes[{index}]"
         result = {"bsdf": self._bsdf(shape.bsdf)}
         if shape.emitter is not None:
+            if shape.emitter.two_sided:
+                raise WavefrontError(f"{where}: Mitsuba has no emission from both sides")
             result["emitter"] = {"type": "area", "radiance": self._parameter(shape.emitter.radiance)}
         if isinstance(shape, description.Mesh):
             # The triangles that we read ourselves: reading files is compared through Mitsuba's XML.

@@ -22,6 +22,7 @@ class Shape:
     first_primitive: wp.int32
     smooth: wp.int32  # 1: has vertex normals
     flip: wp.int32  # 1: a sphere that faces inwards
+    two_sided: wp.int32  # 1: the back emits too
 
 
 @wp.struct

@@ -7,7 +7,21 @@ import functools
 import warp as wp
 
 from wavefront.accel.mesh_query import INFINITE, Geometry
-from wavefront.light.tables import KIND_CONSTANT, KIND_SPHERE, KIND_TRIANGLE, LightTables
+from wavefront.light.delta import spot_falloff
+from wavefront.light.envmap import make_envmap
+from wavefront.light.sun import sample_sun
+from wavefront.light.tables import (
+    KIND_CONSTANT,
+    KIND_DIRECTIONAL,
+    KIND_ENVMAP_BYTES,
+    KIND_ENVMAP_FLOATS,
+    KIND_POINT,
+    KIND_SPHERE,
+    KIND_SPOT,
+    KIND_SUN,
+    KIND_TRIANGLE,
+    LightTables,
+)
 from wavefront.surface import position_error, scaled_cross, sphere_uv, triangle_extent
 from wavefront.texture import TextureTables, make_eval_parameter
 from wavefront.warp_samples import (
@@ -30,7 +44,8 @@ class LightSample:
     target: wp.vec3  # where the shadow ray ends; unused for the environment
     t_max: wp.float32  # of a shadow ray to the target, in units of its distance; INFINITE for the environment
     L: wp.vec3  # emitted radiance; zero if the sample is useless
-    pdf: wp.float32  # in solid angle, selection included
+    pdf: wp.float32  # in solid angle, selection included; of a light without extent, the probability of its selection
+    delta: wp.int32  # 1: a light without extent, of which L is the irradiance on a surface that faces it
 
 
 @wp.func
@@ -41,13 +56,9 @@ def select_light(lights: LightTables, u: wp.vec2) -> int:
     together are one number of 40 bits in fixed point; times n, its integer part is the cell and its fraction chooses.
     """
     n = lights.lights.shape[0]
-    high = wp.uint64(u[0] * 16777216.0)
-    low = wp.uint64(u[1] * 65536.0)
-    scaled = (high * wp.uint64(65536) + low) * wp.uint64(n)
-    cell = int(scaled >> wp.uint64(40))
-    fraction = float(scaled & wp.uint64(0xFFFFFFFFFF)) * 9.094947017729282e-13  # 2^-40
+    cell = wp.min(int(u * float(n)), n - 1)
     light = lights.lights[cell]
-    return wp.where(fraction < light.alias_threshold, cell, light.alias)
+    return wp.where(u < light.alias_threshold, cell, light.alias)
 
 
 @wp.func
@@ -71,14 +82,19 @@ def make_light_sampler(kinds: tuple[str, ...], textures: tuple[str, ...]):
         textures: Kinds of texture that emitters may have.
 
     Returns:
-        `sample_light(lights, geometry, textures, p, u) -> LightSample` for a point p, where u.x and u.w choose the
-        light, and
+        `sample_light(lights, geometry, textures, p, u) -> LightSample` for a point p, and
         `light_pdf(lights, geometry, light, p, wi, q, normal) -> float`, the density in solid angle with which that
-        would have chosen the point q (with its normal) of a light, seen from p in direction wi.
+        would have chosen the point q (with its normal) of an area light, seen from p in direction wi.
     """
     has_triangle = "triangle" in kinds
     has_sphere = "sphere" in kinds
     has_constant = "constant" in kinds
+    has_envmap = "envmap_bytes" in kinds or "envmap_floats" in kinds
+    eval_envmap, sample_envmap = make_envmap("envmap_bytes" in kinds)
+    has_directional = "directional" in kinds
+    has_point = "point" in kinds or "spot" in kinds
+    has_spot = "spot" in kinds
+    has_sun = "sun" in kinds
     textured = bool(textures)
     eval_parameter = make_eval_parameter(textures)
 
@@ -88,10 +104,10 @@ def make_light_sampler(kinds: tuple[str, ...], textures: tuple[str, ...]):
     ) -> LightSample:
         result = LightSample()
         result.t_max = SHADOW_T_MAX
-        light = lights.lights[select_light(lights, wp.vec2(u[0], u[3]))]
-        emitter = lights.emitters[light.emitter]
+        light = lights.lights[select_light(lights, u[0])]
         if wp.static(has_triangle):
             if light.kind == KIND_TRIANGLE:
+                emitter = lights.emitters[light.emitter]
                 i0 = geometry.indices[3 * light.primitive]
                 i1 = geometry.indices[3 * light.primitive + 1]
                 i2 = geometry.indices[3 * light.primitive + 2]
@@ -108,10 +124,13 @@ def make_light_sampler(kinds: tuple[str, ...], textures: tuple[str, ...]):
                 cross = scaled_cross(v0, v1, v2, extent)
                 normal = wp.normalize(cross)
                 shading_normal = normal
-                if geometry.shapes[geometry.shape_of[light.primitive]].smooth == 1:
+                shape = geometry.shapes[geometry.shape_of[light.primitive]]
+                if shape.smooth == 1:
                     shading_normal = b[0] * geometry.normals[i0] + b[1] * geometry.normals[i1]
                     shading_normal += b2 * geometry.normals[i2]
                 if wp.dot(shading_normal, normal) < 0.0:
+                    normal = -normal
+                if shape.two_sided == 1 and wp.dot(normal, wi) > 0.0:
                     normal = -normal
                 # Emission is towards the front of the geometric normal; the density in area, 2 / |cross|, becomes one
                 # in solid angle by distance^2 / cos. Both lengths are in units of the extent.
@@ -126,11 +145,15 @@ def make_light_sampler(kinds: tuple[str, ...], textures: tuple[str, ...]):
                     result.L = eval_parameter(textures, emitter.radiance, emitter.radiance_texture, uv)
         if wp.static(has_sphere):
             if light.kind == KIND_SPHERE:
+                emitter = lights.emitters[light.emitter]
                 sphere = geometry.spheres[light.primitive - geometry.triangle_count]
-                inwards = geometry.shapes[geometry.shape_of[light.primitive]].flip == 1
+                shape = geometry.shapes[geometry.shape_of[light.primitive]]
                 center = wp.vec3(sphere[0], sphere[1], sphere[2])
                 r = sphere[3]
                 one_minus_cos = sphere_cone(sphere, p)
+                inwards = shape.flip == 1
+                if shape.two_sided == 1:
+                    inwards = one_minus_cos <= 0.0
                 normal = wp.vec3(0.0)
                 if one_minus_cos > 0.0:
                     to_center = center - p
@@ -167,7 +190,44 @@ def make_light_sampler(kinds: tuple[str, ...], textures: tuple[str, ...]):
                 result.wi = square_to_sphere(wp.vec2(u[1], u[2]))
                 result.t_max = INFINITE
                 result.pdf = light.pmf * sphere_pdf()
-                result.L = emitter.radiance
+                result.L = lights.emitters[light.emitter].radiance
+        if wp.static(has_envmap):
+            if light.kind == KIND_ENVMAP_BYTES or light.kind == KIND_ENVMAP_FLOATS:
+                result.wi = sample_envmap(lights.envmap, wp.vec3(u[1], u[2], u[3]))
+                # Radiance and density of the rounded direction: what a ray that escapes in it will find.
+                found = eval_envmap(lights.envmap, result.wi)
+                result.t_max = INFINITE
+                result.pdf = light.pmf * found.pdf
+                result.L = wp.where(found.pdf > 0.0, found.L, wp.vec3(0.0))
+        if wp.static(has_directional):
+            if light.kind == KIND_DIRECTIONAL:
+                distant = lights.distant[light.emitter]
+                result.wi = distant.direction
+                result.t_max = INFINITE
+                result.pdf = light.pmf
+                result.L = distant.emitted
+                result.delta = 1
+        if wp.static(has_point):
+            if light.kind == KIND_POINT or light.kind == KIND_SPOT:
+                point = lights.points[light.emitter]
+                to_light = point.position - p
+                distance2 = wp.dot(to_light, to_light)
+                if distance2 > 0.0:
+                    result.wi = wp.normalize(to_light)
+                    result.target = point.position
+                    result.pdf = light.pmf
+                    result.L = point.intensity / distance2
+                    result.delta = 1
+                    if wp.static(has_spot):
+                        if light.kind == KIND_SPOT:
+                            result.L *= spot_falloff(point, -result.wi)
+        if wp.static(has_sun):
+            if light.kind == KIND_SUN:
+                distant = lights.distant[light.emitter]
+                result.wi = sample_sun(distant, wp.vec2(u[1], u[2]))
+                result.t_max = INFINITE
+                result.pdf = light.pmf * cone_pdf(distant.one_minus_cos)
+                result.L = distant.emitted
         return result
 
     @wp.func
@@ -193,9 +253,6 @@ def make_light_sampler(kinds: tuple[str, ...], textures: tuple[str, ...]):
                 else:
                     pdf = sphere_pdf() * wp.length_sq(q - p)
                     pdf /= wp.abs(wp.dot(normal, wi)) * sphere[3] * sphere[3]
-        if wp.static(has_constant):
-            if light.kind == KIND_CONSTANT:
-                pdf = sphere_pdf()
         return light.pmf * pdf
 
     return sample_light, light_pdf

@@ -70,7 +70,7 @@ IDENTITY_UV = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 
 
 class Bitmap(Record, tag_field="type", tag="bitmap"):
-    """An image file: PNG or JPEG (8 bit), or OpenEXR."""
+    """An image file: PNG or JPEG (8 bit), OpenEXR, or Radiance HDR."""
 
     file: Annotated[str, Meta(description="Path of the image, relative to the scene file.", min_length=1)]
     name: str = ""
@@ -253,9 +253,10 @@ Bsdf = (
 
 
 class Area(Record, tag_field="type", tag="area"):
-    """Diffuse emission from the front of a shape."""
+    """Diffuse emission from the front of a shape, or from both sides."""
 
     radiance: Annotated[Radiance, Meta(description="W / (m^2 sr)")] = 1.0
+    two_sided: Annotated[bool, Meta(description="The back emits as the front does.")] = False
 
 
 class Constant(Record, tag_field="type", tag="constant"):
@@ -265,7 +266,70 @@ class Constant(Record, tag_field="type", tag="constant"):
     radiance: NonNegative | RGB = 1.0
 
 
-Emitter = Constant
+class Envmap(Record, tag_field="type", tag="envmap"):
+    """An image of the environment in latitude and longitude: its middle is at local -Z, its first row at +Y.
+
+    The columns go clockwise seen from above, from +Z over +X. The first and the last row are the poles themselves.
+    """
+
+    file: Annotated[
+        str,
+        Meta(description="OpenEXR, Radiance HDR, PNG or JPEG (8 bit, sRGB), relative to the scene file.", min_length=1),
+    ]
+    name: str = ""
+    scale: Annotated[NonNegative, Meta(description="Multiplies the image.")] = 1.0
+    to_world: Annotated[Transform, Meta(description="A rotation or a mirror; other parts have no meaning here.")] = []
+
+
+class Directional(Record, tag_field="type", tag="directional"):
+    """Parallel light from infinitely far away. Found by next-event estimation only."""
+
+    direction: Annotated[Vec3, Meta(description="Where the light travels to.")]
+    name: str = ""
+    irradiance: Annotated[NonNegative | RGB, Meta(description="On a surface that faces the light, W / m^2.")] = 1.0
+
+
+class Point(Record, tag_field="type", tag="point"):
+    """Light from a point, the same in all directions. Found by next-event estimation only."""
+
+    position: Vec3
+    name: str = ""
+    intensity: Annotated[NonNegative | RGB, Meta(description="W / sr")] = 1.0
+
+
+class Spot(Record, tag_field="type", tag="spot"):
+    """Light from a point into a cone: full up to beam_width, from there falling linearly with the angle to zero.
+
+    Found by next-event estimation only.
+    """
+
+    position: Vec3
+    direction: Annotated[Vec3, Meta(description="Axis of the cone, away from the light.")]
+    name: str = ""
+    intensity: Annotated[NonNegative | RGB, Meta(description="Along the axis, W / sr.")] = 1.0
+    cutoff_angle: Annotated[
+        float, Meta(gt=0.0, le=180.0, description="Where the light ends, degrees from the axis.")
+    ] = 20.0
+    beam_width: Annotated[
+        Annotated[float, Meta(ge=0.0, le=180.0)] | None,
+        Meta(description="Where it begins to fall, degrees from the axis; default: 3/4 of cutoff_angle."),
+    ] = None
+
+
+class Sun(Record, tag_field="type", tag="sun"):
+    """A disc of even radiance, infinitely far away."""
+
+    direction: Annotated[Vec3, Meta(description="Where the light of its centre travels to.")]
+    name: str = ""
+    angle: Annotated[float, Meta(gt=0.0, le=90.0, description="Angular radius of the disc, degrees.")] = 0.2665
+    irradiance: Annotated[
+        NonNegative | RGB | None,
+        Meta(description="On a surface that faces the light, W / m^2; excludes radiance. Default: 1."),
+    ] = None
+    radiance: Annotated[NonNegative | RGB | None, Meta(description="Of the disc, W / (m^2 sr).")] = None
+
+
+Emitter = Constant | Envmap | Directional | Point | Spot | Sun
 
 # --- shapes ----------------------------------------------------------------------------------------------------
 
@@ -391,9 +455,7 @@ class Scene(Record):
     integrator: PathIntegrator = msgspec.field(default_factory=PathIntegrator)
     textures: Annotated[list[Texture], Meta(description="Named textures.")] = []
     bsdfs: Annotated[list[Bsdf], Meta(description="Named BSDFs.")] = []
-    emitters: Annotated[
-        list[Emitter], Meta(description="Emitters that are not shapes; at most one constant environment.")
-    ] = []
+    emitters: Annotated[list[Emitter], Meta(description="Emitters that are not shapes; at most one environment.")] = []
     include: Annotated[
         list[str], Meta(description="Scene files whose textures, bsdfs, emitters and shapes are added to this one.")
     ] = []

@@ -12,10 +12,11 @@ from wavefront.bsdf import tables as bsdf_tables
 from wavefront.bsdf.coating import diffuse_fresnel, rough_coating
 from wavefront.errors import SceneError
 from wavefront.film import LUMINANCE
-from wavefront.light import tables as light_tables
+from wavefront.light.tables import EmitterRecord, LightTables
 from wavefront.scene import description
 from wavefront.scene.images import load_image
 from wavefront.scene.ior import CONDUCTORS, INDEX_OF_REFRACTION
+from wavefront.scene.light_upload import LightUpload
 from wavefront.scene.lookup import resolve_bsdf, resolve_texture
 from wavefront.scene.meshes import clear_cache, tessellate
 from wavefront.scene.transforms import to_matrix
@@ -43,7 +44,7 @@ class DeviceScene:
     geometry: Geometry
     materials: bsdf_tables.MaterialTables
     textures: TextureTables
-    lights: light_tables.LightTables
+    lights: LightTables
     triangle_count: int
     sphere_count: int
     light_count: int
@@ -182,7 +183,10 @@ class _Upload:
     def run(self) -> DeviceScene:
         meshes, spheres = self._collect_shapes()
         geometry, bounds = self._upload_geometry(meshes, spheres)
-        lights, light_kinds = self._upload_lights(meshes, spheres, bounds)
+        luminances = [self._mean_luminance(emitter) for emitter in range(len(self.emitters))]
+        upload = LightUpload(self.scene, self.emitters, luminances, self.device, self.notes)
+        lights, light_kinds = upload.run(meshes, spheres, bounds)
+        lights.emitters = _struct_array(EmitterRecord, self.emitters, self.device)
         geometry.shapes = _struct_array(Shape, self.shape_records, self.device)
         materials = bsdf_tables.MaterialTables()
         materials.materials = _struct_array(bsdf_tables.Material, self.materials, self.device)
@@ -305,6 +309,7 @@ class _Upload:
             where = f"shapes[{i}]"
             emitter = self._emitter(shape.emitter, where) if shape.emitter is not None else -1
             record = {"material": self._material(shape.bsdf, f"{where}.bsdf"), "first_light": -1}
+            record["two_sided"] = int(shape.emitter is not None and shape.emitter.two_sided)
             if isinstance(shape, description.Sphere):
                 matrix = to_matrix(shape.to_world, f"{where}.to_world")
                 center = matrix[:3, :3] @ np.asarray(shape.center) + matrix[:3, 3]
@@ -379,54 +384,3 @@ class _Upload:
         record = self.emitters[emitter]
         texture = record["radiance_texture"]
         return float((record["radiance"] if texture < 0 else self.atlas.means[texture]) @ np.asarray(LUMINANCE))
-
-    def _upload_lights(self, meshes, spheres, bounds) -> tuple[light_tables.LightTables, tuple[str, ...]]:
-        """One light for every emissive triangle, sphere, and the environment, selected by power."""
-        kinds, primitives, emitters, powers = [], [], [], []
-        count = 0
-        for record, mesh, emitter in meshes:
-            if emitter < 0:
-                continue
-            a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.float64) for i in range(3))
-            areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-            record["first_light"] = count
-            count += len(areas)
-            kinds.append(np.full(len(areas), light_tables.KINDS["triangle"]))
-            primitives.append(record["first_primitive"] + np.arange(len(areas)))
-            emitters.append(np.full(len(areas), emitter))
-            powers.append(areas * np.pi * self._mean_luminance(emitter))
-        for record, _, radius, emitter, _ in spheres:
-            if emitter < 0:
-                continue
-            record["first_light"] = count
-            count += 1
-            kinds.append([light_tables.KINDS["sphere"]])
-            primitives.append([record["first_primitive"]])
-            emitters.append([emitter])
-            powers.append([4.0 * np.pi * radius**2 * np.pi * self._mean_luminance(emitter)])
-        tables = light_tables.LightTables()
-        tables.environment = -1
-        for environment in self.scene.emitters:
-            self.emitters.append({"radiance": _rgb(environment.radiance), "radiance_texture": -1})
-            tables.environment = count
-            count += 1
-            kinds.append([light_tables.KINDS["constant"]])
-            primitives.append([-1])
-            emitters.append([len(self.emitters) - 1])
-            # Flux through the bounding sphere of the scene.
-            radius = 0.5 * float(np.linalg.norm(bounds[1] - bounds[0])) or 1.0
-            powers.append([4.0 * np.pi**2 * radius**2 * self._mean_luminance(len(self.emitters) - 1)])
-        power = np.concatenate(powers) if powers else np.zeros(0)
-        if not power.sum() > 0.0:  # black emitters: nothing to sample, and nothing to find
-            for record in self.shape_records:
-                record["first_light"] = -1
-            tables.environment, count, kinds = -1, 0, []
-        host = np.zeros(count, dtype=light_tables.Light.numpy_dtype())
-        if count:
-            host["kind"], host["primitive"] = np.concatenate(kinds), np.concatenate(primitives)
-            host["emitter"] = np.concatenate(emitters)
-            host["pmf"], host["alias_threshold"], host["alias"] = light_tables.build_alias_table(power)
-        tables.lights = wp.array(host, dtype=light_tables.Light, device=self.device)
-        tables.emitters = _struct_array(light_tables.EmitterRecord, self.emitters, self.device)
-        names = {index: name for name, index in light_tables.KINDS.items()}
-        return tables, tuple(sorted({names[k] for k in host["kind"]}))

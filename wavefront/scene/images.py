@@ -1,4 +1,4 @@
-"""Image files to arrays and back: Pillow for 8-bit images, OpenEXR for floating point."""
+"""Image files to arrays and back: Pillow for 8-bit images, OpenEXR for floating point, OpenImageIO for Radiance HDR."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
 def load_image(path: str | os.PathLike, where: str = "") -> np.ndarray:
     """Pixels of an image file, first row on top, as encoded (no colour conversion).
 
-    8-bit images give uint8; OpenEXR and 16-bit grey PNG give float32 (16-bit scaled to [0, 1]). Alpha is dropped
-    (colours are not premultiplied by it), palettes are expanded, CMYK and other modes become RGB. Pillow reads 16-bit
-    colour PNG with 8 bits.
+    8-bit images give uint8; OpenEXR, Radiance HDR and 16-bit grey PNG give float32 (16-bit scaled to [0, 1]). Alpha is
+    dropped (colours are not premultiplied by it), palettes are expanded, CMYK and other modes become RGB. Pillow
+    reads 16-bit colour PNG with 8 bits.
 
     Args:
         path: The file.
@@ -66,7 +66,8 @@ def load_image(path: str | os.PathLike, where: str = "") -> np.ndarray:
         raise SceneError(f"{path}: file not found", path=where)
     if not path.is_file():
         raise SceneError(f"{path}: not a file", path=where)
-    pixels = _load_exr(path, where) if path.suffix.lower() == ".exr" else _load_pillow(path, where)
+    load = {".exr": _load_exr, ".hdr": _load_hdr}.get(path.suffix.lower(), _load_pillow)
+    pixels = load(path, where)
     if not pixels.size:
         raise SceneError(f"{path}: the image has no pixels", path=where)
     return np.ascontiguousarray(pixels)
@@ -104,6 +105,17 @@ def _load_exr(path, where):
     if len(colours) == 1:
         return channels[colours[0]][:, :, None]
     raise SceneError(f"{path}: has channels {', '.join(channels)}; needed: R, G, B, or one channel", path=where)
+
+
+def _load_hdr(path, where):
+    import OpenImageIO  # only here: hardly any scene needs it
+
+    image = OpenImageIO.ImageInput.open(str(path))
+    pixels = image.read_image(0, 0, 0, image.spec().nchannels, OpenImageIO.FLOAT) if image else None
+    if pixels is None:
+        text = " ".join((image or OpenImageIO).geterror().split()) or "not a Radiance HDR file"
+        raise SceneError(f"{path}: cannot be read: {text}", path=where)
+    return np.asarray(pixels, np.float32)
 
 
 # --- writing ---------------------------------------------------------------------------------------------------

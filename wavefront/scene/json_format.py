@@ -183,7 +183,7 @@ def _convert(raw, path, overrides=()):
 
 def _make_absolute(scene, base):
     for _, record in walk(scene):
-        if isinstance(record, (description.Bitmap, description.Mesh)) and record.file:
+        if isinstance(record, (description.Bitmap, description.Envmap, description.Mesh)) and record.file:
             record.file = os.path.abspath(os.path.join(base, record.file))
 
 

@@ -20,8 +20,9 @@ import numpy as np
 from wavefront.errors import SceneError
 from wavefront.scene import description, transforms
 from wavefront.scene.meshes import has_file_normals
+from wavefront.scene.mitsuba_emitters import Emitters
 from wavefront.scene.mitsuba_materials import Materials
-from wavefront.scene.mitsuba_xml import Document, Plugin, read
+from wavefront.scene.mitsuba_xml import Document, Plugin, read, rows, world_matrix
 
 UNLIMITED_DEPTH = 1000
 # Mitsuba's camera looks along +Z with +X to the left; ours along -Z with +X to the right.
@@ -66,6 +67,7 @@ class _Importer:
     def __init__(self, document: Document, warn: Callable[[str], object]):
         self.document, self.warn = document, warn
         self.materials = Materials(document, warn)
+        self.emitters = Emitters(document, warn, self.materials)
 
     def scene(self):
         root = self.document.scene
@@ -84,7 +86,7 @@ class _Importer:
         camera, film, spp = self._sensor(groups.get("sensor", []))
         integrator = self._integrator(groups.get("integrator", [None])[0], spp)
         shapes = [self._shape(plugin) for plugin in groups.get("shape", [])]
-        emitters = [self._emitter(plugin) for plugin in groups.get("emitter", [])]
+        emitters = [self.emitters.emitter(plugin) for plugin in groups.get("emitter", [])]
         self.materials.unused()
         return description.Scene(
             shapes=shapes,
@@ -121,8 +123,8 @@ class _Importer:
             if plugin.get(name) is not None:
                 self.warn(f"{plugin.get(name).where()}: {name} is left out; nothing is clipped")
         plugin.ignore("focus_distance", "shutter_open", "shutter_close", "near_clip", "far_clip")
-        matrix = self._matrix(plugin)
-        camera = description.Perspective(fov=fov, fov_axis=axis, to_world=_rows(matrix @ CAMERA_FRAME))
+        matrix = world_matrix(plugin)
+        camera = description.Perspective(fov=fov, fov_axis=axis, to_world=rows(matrix @ CAMERA_FRAME))
         spp = self._sampler(plugin)
         film = self._film(plugin)
         plugin.finish("film", "sampler")
@@ -230,27 +232,7 @@ class _Importer:
             raise plugin.get("rr_depth").error(f"rr_depth must be at least 1; found {rr_depth}")
         return description.PathIntegrator(max_depth=max_depth, rr_depth=rr_depth, spp=spp)
 
-    # --- emitters and shapes -------------------------------------------------------------------------------------
-
-    def _emitter(self, plugin):
-        if plugin.type != "constant":
-            if plugin.type == "area":
-                raise plugin.error(f"{plugin.label()} belongs inside a shape")
-            raise plugin.error(f"{plugin.label()} is not supported; supported: area, constant")
-        radiance = self.materials.colour(plugin, "radiance", 1.0, emitted=True)
-        if not isinstance(radiance, (float, list)):
-            raise plugin.error("the radiance of a constant emitter must be a colour, not a texture")
-        plugin.ignore("sampling_weight")
-        plugin.finish()
-        return description.Constant(radiance=radiance, name=plugin.id)
-
-    def _area(self, plugin):
-        if plugin.type != "area":
-            raise plugin.error(f"{plugin.label()} is not supported inside a shape; supported: area")
-        record = description.Area(radiance=self.materials.colour(plugin, "radiance", 1.0, emitted=True))
-        plugin.ignore("sampling_weight")
-        plugin.finish("texture")
-        return record
+    # --- shapes -------------------------------------------------------------------------------------------------
 
     def _shape(self, plugin):
         kinds = {
@@ -264,15 +246,15 @@ class _Importer:
         if plugin.type not in kinds:
             raise plugin.error(f"{plugin.label()} is not supported; supported: {', '.join(kinds)}")
         common = {"name": plugin.id, "flip_normals": plugin.boolean("flip_normals")}
-        matrix = self._matrix(plugin)
+        matrix = world_matrix(plugin)
         if not np.array_equal(matrix, np.eye(4)):
-            common["to_world"] = _rows(matrix)
+            common["to_world"] = rows(matrix)
         bsdfs, emitters = plugin.objects("bsdf"), plugin.objects("emitter")
         for found in (bsdfs, emitters):
             if len(found) > 1:
                 raise found[1].error(f"a shape has one {found[1].tag}; found {len(found)}")
         if emitters:
-            common["emitter"] = self._area(emitters[0])
+            common["emitter"] = self.emitters.area(emitters[0])
             # an emitter without a BSDF reflects nothing in Mitsuba 3
             common["bsdf"] = description.Diffuse(reflectance=0.0)
         if bsdfs:
@@ -322,20 +304,3 @@ class _Importer:
             flip_v=None if flip_v == is_obj else flip_v,
             **common,
         )
-
-    def _matrix(self, plugin):
-        """The (4, 4) to_world of a plugin."""
-        matrix = plugin.transform("to_world")
-        if matrix is None:
-            return np.eye(4)
-        element = plugin.get("to_world")
-        try:
-            transforms.check_affine(matrix)
-            transforms.check_invertible(matrix)
-        except SceneError as error:
-            raise element.error(error.message) from None
-        return matrix
-
-
-def _rows(matrix):
-    return [tuple(float(value) + 0.0 for value in row) for row in matrix]  # + 0.0: no minus zeros

@@ -19,6 +19,7 @@ from xml.parsers import expat
 import numpy as np
 
 from wavefront.errors import SceneError
+from wavefront.scene import transforms
 from wavefront.scene.mitsuba_values import STEP_TAGS, Element, nearest, to_matrix, to_number, to_xyz
 
 OBJECT_TAGS = (
@@ -277,6 +278,25 @@ def read(path: Path, parameters: Mapping[str, object]) -> Document:
             raise SceneError(f"the scene has no parameter ${name}; {nearest(name, builder.used)}", path)
     _check_references(document)
     return document
+
+
+def world_matrix(plugin: Plugin) -> np.ndarray:
+    """The (4, 4) to_world of a plugin. Raises SceneError with file and line: projective or not invertible."""
+    matrix = plugin.transform("to_world")
+    if matrix is None:
+        return np.eye(4)
+    element = plugin.get("to_world")
+    try:
+        transforms.check_affine(matrix)
+        transforms.check_invertible(matrix)
+    except SceneError as error:
+        raise element.error(error.message) from None
+    return matrix
+
+
+def rows(matrix: np.ndarray) -> list[tuple[float, ...]]:
+    """A matrix as a transform record."""
+    return [tuple(float(value) + 0.0 for value in row) for row in matrix]  # + 0.0: no minus zeros
 
 
 def _check_references(document):

@@ -15,7 +15,7 @@ from wavefront.scene.lookup import BSDF_FIELDS, NUMBER_FIELDS, TEXTURE_FIELDS, s
 from wavefront.scene.transforms import to_matrix
 
 MESH_SUFFIXES = (".ply", ".obj", ".gltf", ".glb")
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".hdr")
 _REFLECTING = ("diffuse", "oren_nayar", "conductor", "rough_conductor", "plastic", "rough_plastic")
 _LARGEST = float(np.finfo(np.float32).max)
 
@@ -35,7 +35,7 @@ def validate(
         for path, record in walk(scene):
             _check_numbers(record, path)
             _check_references(record, path, bsdfs, textures)
-            if isinstance(record, description.Bitmap):
+            if isinstance(record, (description.Bitmap, description.Envmap)):
                 _check_file(record.file, IMAGE_SUFFIXES, "image", f"{path}.file")
             elif isinstance(record, (description.Conductor, description.RoughConductor)):
                 _check_conductor(record, path)
@@ -52,8 +52,7 @@ def validate(
                     f"shapes[{i}].to_world", "a sphere can be scaled uniformly only; found different scales or a shear"
                 )
         _check_transform(scene.camera.to_world, "camera.to_world")
-        if len(scene.emitters) > 1:
-            _fail("emitters[1]", f"a scene has at most one constant environment; found {len(scene.emitters)}")
+        _check_emitters(scene)
         for i, aov in enumerate(scene.film.aovs):
             if aov in scene.film.aovs[:i]:
                 _fail(f"film.aovs[{i}]", f"{aov!r} is given twice")
@@ -75,6 +74,12 @@ def _find_warnings(scene):
         warnings.append("the scene has no shapes")
     if not scene.emitters and all(shape.emitter is None for shape in scene.shapes):
         warnings.append("the scene has no emitter: the image will be black")
+    for i, emitter in enumerate(scene.emitters if not scene.integrator.nee else ()):
+        if isinstance(emitter, (description.Directional, description.Point, description.Spot)):
+            kind = emitter.__struct_config__.tag
+            warnings.append(
+                f"emitters[{i}]: a {kind} light adds nothing where integrator.nee is false: no ray meets it"
+            )
     for kind in ("textures", "bsdfs"):
         for i, record in enumerate(getattr(scene, kind)):
             if not record.name:
@@ -152,6 +157,32 @@ def _check_cycle(name, path, bsdfs):
             for field in BSDF_FIELDS.intersection(record.__struct_fields__):
                 if isinstance(getattr(record, field), str):
                     stack.append((getattr(record, field), depth + 1))
+
+
+# --- emitters --------------------------------------------------------------------------------------------------
+
+
+def _check_emitters(scene):
+    environment = None
+    for i, emitter in enumerate(scene.emitters):
+        path = f"emitters[{i}]"
+        if isinstance(emitter, (description.Constant, description.Envmap)):
+            if environment is not None:
+                _fail(path, f"a scene has at most one environment; {environment} is one already")
+            environment = path
+        if isinstance(emitter, description.Envmap):
+            matrix = _check_transform(emitter.to_world, f"{path}.to_world")
+            if matrix is not None and not _is_similarity(matrix):
+                _fail(f"{path}.to_world", "an environment can be rotated; found different scales or a shear")
+        direction = getattr(emitter, "direction", None)
+        if direction is not None and not np.linalg.norm(direction) > 0.0:
+            _fail(f"{path}.direction", "the direction is zero")
+        if isinstance(emitter, description.Spot):
+            if emitter.beam_width is not None and emitter.beam_width > emitter.cutoff_angle:
+                found = f"{emitter.beam_width:g} and {emitter.cutoff_angle:g}"
+                _fail(f"{path}.beam_width", f"expected at most cutoff_angle; found {found}")
+        if isinstance(emitter, description.Sun) and emitter.irradiance is not None and emitter.radiance is not None:
+            _fail(path, "a sun has irradiance or radiance; found both")
 
 
 # --- shapes ----------------------------------------------------------------------------------------------------

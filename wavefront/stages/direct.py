@@ -11,7 +11,7 @@ from wavefront.bsdf.dispatch import is_smooth, make_bsdf
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.light.mis import power_heuristic
 from wavefront.light.sampling import make_light_sampler
-from wavefront.light.tables import LightTables
+from wavefront.light.tables import DELTA, LightTables
 from wavefront.queues import (
     DEPTH,
     NONFINITE_DIRECT,
@@ -39,6 +39,7 @@ def make_direct(
     """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
     eval_bsdf, _, _ = make_bsdf(bsdfs, mask, textures)
     sample_light, _ = make_light_sampler(lights, light_textures)
+    extended = any(kind not in DELTA for kind in lights)
 
     @wp.kernel(enable_backward=False, module="unique")
     def sample_direct_light(
@@ -81,7 +82,10 @@ def make_direct(
             return
 
         # resolve
-        weight = power_heuristic(light.pdf, bsdf.pdf) / light.pdf
+        weight = 1.0 / light.pdf
+        if wp.static(extended):
+            if light.delta == 0:
+                weight *= power_heuristic(light.pdf, bsdf.pdf)
         L = weight * wp.cw_mul(paths.beta[slot], wp.cw_mul(bsdf.value, light.L))
         if not (wp.isfinite(L) and wp.min(L) >= 0.0):
             wp.atomic_add(counters, NONFINITE_DIRECT, 1)

@@ -9,7 +9,7 @@ import warp as wp
 from wavefront.accel.mesh_query import Geometry
 from wavefront.light.mis import power_heuristic
 from wavefront.light.sampling import make_light_sampler
-from wavefront.light.tables import LightTables
+from wavefront.light.tables import AREA, LightTables
 from wavefront.queues import NONFINITE_EMISSION, Paths, Queue, Surfaces, queue_size
 from wavefront.stages.contribution import add_radiance
 from wavefront.texture import TextureTables, make_eval_parameter
@@ -18,7 +18,7 @@ from wavefront.texture import TextureTables, make_eval_parameter
 @functools.cache
 def make_emission(lights: tuple[str, ...], light_textures: tuple[str, ...], light_sampling: bool):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
-    area_lights = tuple(kind for kind in lights if kind != "constant")
+    area_lights = tuple(kind for kind in lights if kind in AREA)
     _, light_pdf = make_light_sampler(area_lights, light_textures)
     eval_parameter = make_eval_parameter(light_textures)
     textured = bool(light_textures)

@@ -1,4 +1,4 @@
-"""Escaped rays: adds the radiance of the environment, weighted against light sampling."""
+"""Escaped rays: adds the radiance of what lies around the scene, weighted against light sampling."""
 
 from __future__ import annotations
 
@@ -6,16 +6,22 @@ import functools
 
 import warp as wp
 
+from wavefront.light.envmap import make_envmap
 from wavefront.light.mis import power_heuristic
+from wavefront.light.sun import in_sun
 from wavefront.light.tables import LightTables
 from wavefront.queues import NONFINITE_ESCAPED, Paths, Queue, queue_size
 from wavefront.stages.contribution import add_radiance
-from wavefront.warp_samples import sphere_pdf
+from wavefront.warp_samples import cone_pdf, sphere_pdf
 
 
 @functools.cache
-def make_escaped(light_sampling: bool):
-    """Kernel of the stage; `light_sampling` is the property of `Features`."""
+def make_escaped(escape_lights: tuple[str, ...], light_sampling: bool):
+    """Kernel of the stage; the arguments are the properties of `Features` of the same name."""
+    has_constant = "constant" in escape_lights
+    has_sun = "sun" in escape_lights
+    has_envmap = "envmap_bytes" in escape_lights or "envmap_floats" in escape_lights
+    eval_envmap, _ = make_envmap("envmap_bytes" in escape_lights, density=light_sampling)
 
     @wp.kernel(enable_backward=False, module="unique")
     def add_environment(
@@ -29,13 +35,31 @@ def make_escaped(light_sampling: bool):
         if i >= queue_size(escaped):
             return
         slot = escaped.slots[i]
-        light = lights.lights[lights.environment]
-        weight = float(1.0)
-        if wp.static(light_sampling):
-            pdf = paths.pdf[slot]
-            if pdf > 0.0:
-                weight = power_heuristic(pdf, light.pmf * sphere_pdf())
-        L = weight * wp.cw_mul(paths.beta[slot], lights.emitters[light.emitter].radiance)
-        add_radiance(paths, slot, L, counters, NONFINITE_ESCAPED)
+        L = wp.vec3(0.0)
+        if wp.static(has_constant):
+            light = lights.lights[lights.environment]
+            weight = float(1.0)
+            if wp.static(light_sampling):
+                if paths.pdf[slot] > 0.0:
+                    weight = power_heuristic(paths.pdf[slot], light.pmf * sphere_pdf())
+            L += weight * lights.emitters[light.emitter].radiance
+        if wp.static(has_envmap):
+            found = eval_envmap(lights.envmap, paths.direction[slot])
+            weight = float(1.0)
+            if wp.static(light_sampling):
+                if paths.pdf[slot] > 0.0:
+                    weight = power_heuristic(paths.pdf[slot], lights.lights[lights.environment].pmf * found.pdf)
+            L += weight * found.L
+        if wp.static(has_sun):
+            for k in range(lights.sun_count):
+                light = lights.lights[lights.first_sun + k]
+                sun = lights.distant[light.emitter]
+                if in_sun(sun, paths.direction[slot]):
+                    weight = float(1.0)
+                    if wp.static(light_sampling):
+                        if paths.pdf[slot] > 0.0:
+                            weight = power_heuristic(paths.pdf[slot], light.pmf * cone_pdf(sun.one_minus_cos))
+                    L += weight * sun.emitted
+        add_radiance(paths, slot, wp.cw_mul(paths.beta[slot], L), counters, NONFINITE_ESCAPED)
 
     return add_environment

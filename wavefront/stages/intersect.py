@@ -12,8 +12,8 @@ from wavefront.surface import make_vertex
 
 
 @functools.cache
-def make_intersect(triangles: bool, spheres: bool, smooth: bool, uvs: bool, area_lights: bool, environment: bool):
-    """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
+def make_intersect(triangles: bool, spheres: bool, smooth: bool, uvs: bool, area_lights: bool, escape_lights: bool):
+    """Kernel of the stage; the arguments are the fields of `Features` of the same name (or whether there are any)."""
     closest_hit, _ = make_intersector(triangles, spheres)
     vertex_of = make_vertex(triangles, spheres, smooth, uvs)
 
@@ -39,7 +39,7 @@ def make_intersect(triangles: bool, spheres: bool, smooth: bool, uvs: bool, area
         hit = closest_hit(geometry, origin, direction)
         if hit.primitive < 0:
             surfaces.material[slot] = -1
-            if wp.static(environment):
+            if wp.static(escape_lights):
                 push(escaped, slot, counters)
             return
         vertex = vertex_of(geometry, origin, direction, hit)
@@ -53,7 +53,8 @@ def make_intersect(triangles: bool, spheres: bool, smooth: bool, uvs: bool, area
             surfaces.uv[slot] = vertex.uv
         if wp.static(area_lights):
             light = int(-1)
-            if shape.first_light >= 0 and wp.dot(vertex.geometric_normal, direction) < 0.0:
+            front = wp.dot(vertex.geometric_normal, direction) < 0.0
+            if shape.first_light >= 0 and (front or shape.two_sided == 1):
                 light = shape.first_light + hit.primitive - shape.first_primitive
                 push(emissive, slot, counters)
             surfaces.light[slot] = light
