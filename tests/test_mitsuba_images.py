@@ -131,12 +131,12 @@ def test_sun(folder, nee):
     path = folder / "scene.xml"
     path.write_text(scenes.document(scenes.SUN, everything=False), encoding="utf-8")
     size = (scenes.SIZE, scenes.SIZE)
-    scene = read(path, *size, scenes.MAX_DEPTH, nee)
+    scene = like_the_peer(load_scene(path), *size, scenes.MAX_DEPTH, nee)
     scene.shapes = [shape for shape in scene.shapes if shape.emitter is None]
     sun = description.Sun(direction=scenes.SUN_DIRECTION, angle=scenes.SUN_ANGLE, radiance=list(scenes.SUN_RADIANCE))
     scene.emitters = [sun]
-    theirs = their_batches(peer.load_xml(path, *size), scenes.MAX_DEPTH, SPP)
-    report("sun", compare(our_batches(scene, SPP), theirs, TILES))
+    theirs = their_batches(peer.load_xml(path, *size), scenes.MAX_DEPTH, 32)
+    check("sun", compare(our_batches(scene, 32), theirs, TILES))
 
 
 @pytest.mark.parametrize("axis", scenes.CAMERAS)

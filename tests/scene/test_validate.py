@@ -229,7 +229,7 @@ def test_unknown_indices_of_refraction_are_refused():
 
 
 def test_the_name_of_a_texture_of_roughness_is_checked():
-    with pytest.raises(SceneError, match="bsdfs\\[0\\].roughness: unknown texture 'clay'"):
+    with pytest.raises(SceneError, match=r"bsdfs\[0\]\.roughness: unknown texture 'clay'"):
         validate(with_bsdfs(d.OrenNayar(roughness="clay")))
 
 

@@ -49,12 +49,8 @@ class LightSample:
 
 
 @wp.func
-def select_light(lights: LightTables, u: wp.vec2) -> int:
-    """Index of a light drawn from the alias table by two uniform numbers.
-
-    A number has 24 bits, too few to choose evenly among 10^5 cells and then between the two lights of a cell. Both
-    together are one number of 40 bits in fixed point; times n, its integer part is the cell and its fraction chooses.
-    """
+def select_light(lights: LightTables, u: float) -> int:
+    """Index of a light drawn from the alias table."""
     n = lights.lights.shape[0]
     cell = wp.min(int(u * float(n)), n - 1)
     light = lights.lights[cell]
