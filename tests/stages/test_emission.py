@@ -21,7 +21,7 @@ def escape(pdf, beta=BETA, radiance=(1.0, 2.0, 3.0), sampling=True, slots=None):
     p = paths(n, pdf=pdf, beta=beta, L=0.125)
     tables = lights([{"pmf": 0.75}, {"pmf": 0.25}], [(9.0, 9.0, 9.0), radiance], environment=1)
     queue = counters.queue("escaped", range(n) if slots is None else slots)
-    launch(make_escaped(sampling), 16, tables, p, queue, counters.array)
+    launch(make_escaped(("constant",), sampling), 16, tables, p, queue, counters.array)
     return p.L.numpy(), counters
 
 
