@@ -17,8 +17,7 @@ from scipy import stats
 
 FALSE_ALARM_RATE = 1e-4  # of the tile tests of one comparison
 RATIO_TOLERANCE = 0.005  # the 95 % confidence interval of the ratio of means must lie within 1 ± this
-# Float32 arithmetic, of which both renderers have their own: left out of the difference of a tile before it is tested.
-ROUNDING = 2e-5
+ROUNDING = 2e-5  # of float32: left out of the difference of a tile before it is tested
 
 
 def tile_means(image: np.ndarray, tiles: tuple[int, int]) -> np.ndarray:
@@ -86,10 +85,17 @@ class Estimate:
 
 @dataclasses.dataclass
 class Comparison:
-    """Two estimates of one image, `a` over `b`."""
+    """Two estimates of one image, `a` over `b`.
+
+    Attributes:
+        a: The one.
+        b: The other.
+        rounding: Part of the mean of a tile that may differ: what arithmetic, of which both have their own, can make.
+    """
 
     a: Estimate
     b: Estimate
+    rounding: float = ROUNDING
 
     @property
     def error(self) -> np.ndarray:
@@ -105,7 +111,7 @@ class Comparison:
     @property
     def p_values(self) -> np.ndarray:
         """Two-sided, [rows, columns, 3]."""
-        difference = np.abs(self.a.tiles - self.b.tiles) - ROUNDING * np.maximum(self.a.tiles, self.b.tiles)
+        difference = np.abs(self.a.tiles - self.b.tiles) - self.rounding * np.maximum(self.a.tiles, self.b.tiles)
         difference, error = np.maximum(difference, 0.0), self.error
         t = np.divide(difference, error, out=np.where(difference > 0.0, np.inf, 0.0), where=error > 0.0)
         return 2.0 * stats.t.sf(t, self.degrees)
@@ -162,6 +168,7 @@ def compare(
     error: float = 0.001,
     least: int = 16,
     most: int = 256,
+    rounding: float = ROUNDING,
     progress: Callable[[Comparison], object] | None = None,
 ) -> Comparison:
     """Takes batches of two renderers until the ratio of their means is known.
@@ -176,11 +183,14 @@ def compare(
             interval that crosses `RATIO_TOLERANCE`.
         least: Batches of each at least.
         most: Batches of each at most; it fails if `error` is not reached by then.
+        rounding: See `Comparison`.
         progress: Called with what is known, after every batch from the `least` on.
     """
     ours, theirs = collect(a, least, tiles), None if isinstance(b, Estimate) else collect(b, least, tiles)
     while True:
-        comparison = Comparison(Estimate.from_batches(ours), b if theirs is None else Estimate.from_batches(theirs))
+        comparison = Comparison(
+            Estimate.from_batches(ours), b if theirs is None else Estimate.from_batches(theirs), rounding
+        )
         if progress is not None:
             progress(comparison)
         if comparison.ratio()[1] <= error:

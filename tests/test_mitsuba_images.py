@@ -22,7 +22,7 @@ import pytest
 from scipy import stats
 
 from tests import mitsuba_scenes as scenes
-from tests.image_test import RATIO_TOLERANCE, Comparison, Estimate, collect, compare
+from tests.image_test import RATIO_TOLERANCE, ROUNDING, Comparison, Estimate, collect, compare
 from wavefront.renderer import Renderer
 from wavefront.scene import description, load_scene
 
@@ -55,10 +55,9 @@ def folder(tmp_path_factory):
     return path
 
 
-def our_batches(scene: description.Scene, spp: int):
-    """Means of consecutive samples of one render, which are independent."""
-    # Another seed for every scene, so that the errors of different tests are independent.
-    renderer = Renderer(scene, seed=zlib.crc32(repr(scene).encode()))
+def our_batches(scene: description.Scene, spp: int, name: str):
+    """Means of consecutive samples of one render, which are independent; so are renders of different names."""
+    renderer = Renderer(scene, seed=zlib.crc32(name.encode()))
     before = np.zeros(1)
     while True:
         renderer.render(spp=spp)
@@ -82,9 +81,9 @@ def like_the_peer(scene: description.Scene, width: int, height: int, max_depth: 
     return scene
 
 
-def compare_xml(path: Path, size: tuple[int, int], max_depth: int, spp: int, tiles, nee=True, **settings) -> Comparison:
+def compare_xml(name: str, path: Path, size: tuple[int, int], max_depth: int, spp: int, tiles, nee=True, **settings):
     """Renders a Mitsuba file with both; `settings` are those of `image_test.compare`."""
-    ours = our_batches(like_the_peer(load_scene(path), *size, max_depth, nee), spp)
+    ours = our_batches(like_the_peer(load_scene(path), *size, max_depth, nee), spp, name)
     return compare(ours, their_batches(peer.load_xml(path, *size), max_depth, spp), tiles, **settings)
 
 
@@ -99,7 +98,7 @@ def check(name: str, comparison: Comparison, tolerance: float = RATIO_TOLERANCE)
 def check_small(folder: Path, name: str, text: str, size=(scenes.SIZE, scenes.SIZE), nee: bool = True) -> None:
     path = folder / "scene.xml"
     path.write_text(text, encoding="utf-8")
-    comparison = compare_xml(path, size, scenes.MAX_DEPTH, 32, TILES, nee)
+    comparison = compare_xml(name, path, size, scenes.MAX_DEPTH, 32, TILES, nee)
     check(name, comparison)
     assert comparison.detectable() < 0.1, "the tiles are too noisy to find anything"
 
@@ -188,11 +187,15 @@ def test_own_scene(path):
     like_the_peer(scene, film.width, film.height, scene.integrator.max_depth)
     theirs = their_batches(peer.load_records(scene), scene.integrator.max_depth, 4)
     noisy = path.stem in NOISY
-    comparison = compare(our_batches(scene, 4), theirs, (8, 8), error=0.004 if noisy else 0.001)
+    comparison = compare(our_batches(scene, 4, path.stem), theirs, (8, 8), error=0.004 if noisy else 0.001)
     check(path.stem, comparison, 0.02 if noisy else RATIO_TOLERANCE)
 
 
 # --- real scenes -------------------------------------------------------------------------------------------------
+
+# Light from a small sphere far away: on the floor of veach-mis, that of the sphere of radius 0.05 is 0.06 to 0.26 %
+# more in Mitsuba 3.9 than in closed form, from which ours differs by 0.003 %.
+ROUNDINGS = {"veach-mis": 0.004}
 
 # File, size, depth, samples per batch. Films are large and batches of few samples: a pixel is a stratum, and the edges
 # of small bright lights make most of the noise.
@@ -210,7 +213,8 @@ REAL = {
 def test_real_scene(name):
     file, size, max_depth, spp = REAL[name]
     tiles = (9, 16) if size[0] * 9 == size[1] * 16 else (8, 8)
-    check(name, compare_xml(Path(REAL_SCENES) / file, size, max_depth, spp, tiles, most=1024))
+    settings = {"most": 1024, "rounding": ROUNDINGS.get(name, ROUNDING)}
+    check(name, compare_xml(name, Path(REAL_SCENES) / file, size, max_depth, spp, tiles, **settings))
 
 
 @needs_real_scenes
@@ -226,7 +230,7 @@ def test_reference_of_veach_ajar():
     )
     account = json.loads(file.with_suffix(".json").read_text(encoding="utf-8"))
     scene = load_scene(Path(REAL_SCENES) / "veach-ajar" / "scene.xml")
-    ours = our_batches(like_the_peer(scene, account["width"], account["height"], account["max_depth"]), 8)
+    ours = our_batches(like_the_peer(scene, account["width"], account["height"], account["max_depth"]), 8, "veach-ajar")
     tiles = (9, 16)
     check("veach-ajar, reference", compare(ours, Estimate.from_errors(image, error, tiles), tiles, most=1024))
 
@@ -239,7 +243,7 @@ def test_tiles_are_calibrated(folder):
     path = folder / "scene.xml"
     path.write_text(scenes.document(scenes.PLAIN["diffuse"], everything=False), encoding="utf-8")
     scene = like_the_peer(load_scene(path), scenes.SIZE, scenes.SIZE, scenes.MAX_DEPTH)
-    p_values, batches = [], our_batches(scene, 16)
+    p_values, batches = [], our_batches(scene, 16, "calibration")
     for _ in range(8):
         a, b = (Estimate.from_batches(collect(batches, 16, TILES)) for _ in range(2))
         p_values.append(Comparison(a, b).p_values[..., 1].ravel())  # channels err together: one of them

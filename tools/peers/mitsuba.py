@@ -113,6 +113,7 @@ def load_xml(path: str | Path, width: int, height: int, parameters: Mapping[str,
     config = parser.ParserConfig(mi.variant())
     # Files in the wild have both; neither changes the image.
     config.unused_parameters = config.unused_properties = mi.LogLevel.Debug
+    config.parallel = False  # the order of emitters, and so the image of a seed, must not vary
     given = {name: str(value) for name, value in (parameters or {}).items()}
     previous = mi.file_resolver()
     resolver = mi.FileResolver(previous)
@@ -174,7 +175,7 @@ def load_records(scene: description.Scene):
     mi = _current()
     with tempfile.TemporaryDirectory(prefix="wavefront-peer-") as folder:
         try:
-            return mi.load_dict(from_records(scene, folder))
+            return mi.load_dict(from_records(scene, folder), parallel=False)  # as in load_xml
         except RuntimeError as error:
             raise WavefrontError(f"Mitsuba: {' '.join(str(error).split())}") from None
 

@@ -187,10 +187,12 @@ class _Writer:
     def _parameter(self, value, scalar=False):
         value = resolve_texture(self.scene, value)
         if isinstance(value, description.Checkerboard):
+            # Where a number is wanted (up to 3.9 at least), Mitsuba's checkerboard has its two colours swapped.
+            first, second = (value.color1, value.color0) if scalar else (value.color0, value.color1)
             return {
                 "type": "checkerboard",
-                "color0": _colour(value.color0),
-                "color1": _colour(value.color1),
+                "color0": _colour(first),
+                "color1": _colour(second),
                 "to_uv": self._uv_transform(value),
             }
         if isinstance(value, description.Bitmap):
