@@ -211,6 +211,15 @@ MIXED: dict[str, list[str]] = {
             f"{_PAINT.format('0.8, 0.3, 0.2')}</bsdf></bsdf>"
         ),
     ],
+    "opacity checkerboard": [
+        FLOOR,
+        WEAK_LAMP,
+        SKY,
+        panel(
+            '<bsdf type="mask"><texture name="opacity" type="checkerboard"><rgb name="color0" value="0.9"/>'
+            f'<rgb name="color1" value="0.2"/></texture>{_PAINT.format("0.8, 0.3, 0.2")}</bsdf>'
+        ),
+    ],
     "opacity bitmap": [
         FLOOR,
         WEAK_LAMP,

@@ -134,8 +134,8 @@ def test_sun(folder, nee):
     scene.shapes = [shape for shape in scene.shapes if shape.emitter is None]
     sun = description.Sun(direction=scenes.SUN_DIRECTION, angle=scenes.SUN_ANGLE, radiance=list(scenes.SUN_RADIANCE))
     scene.emitters = [sun]
-    theirs = their_batches(peer.load_xml(path, *size), scenes.MAX_DEPTH, 32)
-    check("sun", compare(our_batches(scene, 32), theirs, TILES))
+    theirs = their_batches(peer.load_xml(path, *size), scenes.MAX_DEPTH, 64)
+    check("sun", compare(our_batches(scene, 64, f"sun {nee}"), theirs, TILES))
 
 
 @pytest.mark.parametrize("axis", scenes.CAMERAS)
@@ -193,8 +193,8 @@ def test_own_scene(path):
 
 # --- real scenes -------------------------------------------------------------------------------------------------
 
-# Light from a small sphere far away: on the floor of veach-mis, that of the sphere of radius 0.05 is 0.06 to 0.26 %
-# more in Mitsuba 3.9 than in closed form, from which ours differs by 0.003 %.
+# Light from a small sphere far away: on the floor of veach-mis, that of the sphere of radius 0.05 is 0.06 to 0.17 %
+# more in Mitsuba 3.9 than in closed form, from which ours differs by 0.003 %; tiles of the two differ by up to 0.26 %.
 ROUNDINGS = {"veach-mis": 0.004}
 
 # File, size, depth, samples per batch. Films are large and batches of few samples: a pixel is a stratum, and the edges

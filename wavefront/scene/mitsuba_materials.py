@@ -279,6 +279,8 @@ class Materials:
             for name, value in colours.items():
                 if not isinstance(value, (float, list)):
                     raise plugin.error(f"{name} of a checkerboard must be a colour, not a texture")
+            if scalar:  # where a number is wanted, Mitsuba 3.9 has the two swapped
+                colours = {"color0": colours["color1"], "color1": colours["color0"]}
             record = description.Checkerboard(**colours, uv_transform=_uv_transform(plugin))
             plugin.finish()
             return record
