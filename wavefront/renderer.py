@@ -136,6 +136,10 @@ class Renderer:
         modules = self.kernels.modules()
         if on_compile:
             on_compile(f"compiling {len(modules)} kernels for {self.device} (cached for the next time)")
+        # Modules share functions, and what a module is hashed to depends on whether another that shares a function has
+        # been built already. Hashed one after another before any is built, they find their cached kernels again.
+        for module in modules:
+            module.get_module_hash(1 if self.device == "cpu" else None)
         # All before the first launch and before any worker starts: a module that loads while another thread launches
         # from it is not safe.
         wp.force_load(self.device, modules=modules, max_workers=os.cpu_count() or 1)
