@@ -32,6 +32,7 @@ def written(tmp_path_factory):
 def test_the_generator_reproduces_the_files(written):
     folder, names = written
     here = {path.relative_to(SCENES).as_posix() for path in SCENES.rglob("*") if path.is_file()}
+    here -= {"images/gallery.jpg"}  # a picture of what the scenes look like, for the README
     assert here == set(names)
     for name in names:
         if name.endswith(".png"):  # compressed as the library likes: the pixels count
@@ -53,8 +54,8 @@ def test_a_scene_loads_without_warnings_and_says_what_it_is_for(name):
 
 def test_files_are_small():
     for path in SCENES.rglob("*"):
-        assert path.is_dir() or path.stat().st_size < 60_000
-    assert sum(path.stat().st_size for path in SCENES.rglob("*") if path.is_file()) < 200_000
+        assert path.is_dir() or path.stat().st_size < 70_000
+    assert sum(path.stat().st_size for path in SCENES.rglob("*") if path.is_file()) < 300_000
 
 
 def test_there_is_a_material_scene_for_every_bsdf():
