@@ -222,12 +222,10 @@ def test_triangle_solid_angle(name):
     assert (samples["L"][~valid] == 0.0).all()
 
 
-@pytest.mark.parametrize("name", TRIANGLES)
+@pytest.mark.parametrize("name", [name for name in TRIANGLES if name != "behind"])  # from behind there is no sample
 def test_triangle_points_are_uniform(name):
     """Chi-square of the barycentric coordinates of the targets; false-alarm rate 1e-4 over the cases."""
     corners, p = TRIANGLES[name]
-    if name == "behind":
-        pytest.skip("no samples")
     corners = np.asarray(corners, np.float32).astype(np.float64)
     samples, _, _ = run(d.Scene(shapes=[triangle(*corners)]), p, uniforms(N, seed=5 + len(name)))
     edges = np.stack([corners[1] - corners[0], corners[2] - corners[0]], axis=1)
