@@ -9,32 +9,15 @@ import warp as wp
 
 from wavefront.accel.mesh_query import Geometry, Shape
 from wavefront.bsdf import tables as bsdf_tables
-from wavefront.bsdf.coating import diffuse_fresnel, rough_coating
-from wavefront.errors import SceneError
 from wavefront.film import LUMINANCE
 from wavefront.light.tables import EmitterRecord, LightTables
 from wavefront.scene import description
-from wavefront.scene.images import load_image
-from wavefront.scene.ior import CONDUCTORS, INDEX_OF_REFRACTION
 from wavefront.scene.light_upload import LightUpload
-from wavefront.scene.lookup import resolve_bsdf, resolve_texture
+from wavefront.scene.material_upload import MaterialUpload
 from wavefront.scene.meshes import clear_cache, tessellate
+from wavefront.scene.texture_upload import TextureAtlas, struct_array
 from wavefront.scene.transforms import to_matrix
-from wavefront.texture import WRAP_MODES, TextureRecord, TextureTables, srgb_to_linear
-
-DISTRIBUTIONS = {"ggx": 0, "beckmann": 1}
-BSDF_KINDS = {
-    description.Diffuse: "diffuse",
-    description.OrenNayar: "oren_nayar",
-    description.Conductor: "conductor",
-    description.RoughConductor: "rough_conductor",
-    description.Dielectric: "dielectric",
-    description.RoughDielectric: "rough_dielectric",
-    description.ThinDielectric: "thin_dielectric",
-    description.Null: "null",
-    description.Plastic: "plastic",
-    description.RoughPlastic: "rough_plastic",
-}
+from wavefront.texture import TextureTables
 
 
 @dataclasses.dataclass
@@ -68,113 +51,11 @@ def upload_scene(scene: description.Scene, device: str) -> DeviceScene:
     return _Upload(scene, device).run()
 
 
-def _struct_array(struct: type, records: list[dict], device: str) -> wp.array:
-    """A device array of structs from dicts of fields (in NumPy, since a struct a triangle in Python is slow)."""
-    host = np.zeros(len(records), dtype=struct.numpy_dtype())
-    for i, record in enumerate(records):
-        for name, value in record.items():
-            host[name][i] = value
-    return wp.array(host, dtype=struct, device=device)
-
-
-class _TextureAtlas:
-    """Collects the textures that parameters refer to, each image once."""
-
-    def __init__(self):
-        self.records: list[dict] = []
-        self.kinds: list[str] = []
-        self.means: list[np.ndarray] = []
-        self.bytes: list[np.ndarray] = []
-        self.floats: list[np.ndarray] = []
-        self.known: dict[tuple, int] = {}
-
-    def add(self, texture: description.Texture, where: str, scalar: bool) -> int:
-        """Index of a texture; `scalar` textures hold numbers, not colours, unless they say otherwise."""
-        key = (repr(texture), scalar)
-        if key not in self.known:
-            self.known[key] = len(self.records)
-            rows = {"uv_row0": texture.uv_transform[0], "uv_row1": texture.uv_transform[1]}
-            if isinstance(texture, description.Checkerboard):
-                color0, color1 = _rgb(texture.color0), _rgb(texture.color1)
-                self._append(
-                    "checkerboard", rows | {"kind": 0, "color0": color0, "color1": color1}, (color0 + color1) / 2
-                )
-            else:
-                self._add_bitmap(texture, where, scalar, rows)
-        return self.known[key]
-
-    def _add_bitmap(self, texture: description.Bitmap, where: str, scalar: bool, rows: dict):
-        pixels = load_image(texture.file, where)
-        height, width, channels = pixels.shape
-        is_bytes = pixels.dtype == np.uint8
-        srgb = texture.color_space == "srgb" or (texture.color_space == "auto" and is_bytes and not scalar)
-        if not is_bytes:
-            if not np.isfinite(pixels).all():
-                y, x = np.argwhere(~np.isfinite(pixels).all(axis=2))[0]
-                raise SceneError(f"{texture.file}: pixel ({x}, {y}) is not finite", path=where)
-            if srgb:
-                pixels = srgb_to_linear(np.maximum(pixels, 0.0)).astype(np.float32)
-        store = self.bytes if is_bytes else self.floats
-        first = sum(part.size for part in store)
-        store.append(pixels.ravel())
-        linear = pixels.reshape(-1, channels) / 255.0 if is_bytes else np.maximum(pixels.reshape(-1, channels), 0.0)
-        if is_bytes and srgb:
-            linear = srgb_to_linear(linear)
-        record = {
-            "kind": 1 if is_bytes else 2,
-            "first": first,
-            "width": width,
-            "height": height,
-            "channels": channels,
-            "srgb": int(srgb),
-            "nearest": int(texture.filter == "nearest"),
-            "wrap": WRAP_MODES[texture.wrap],
-        }
-        self._append("bytes" if is_bytes else "floats", rows | record, np.broadcast_to(linear.mean(axis=0), 3))
-
-    def _append(self, kind: str, record: dict, mean: np.ndarray):
-        self.records.append(record)
-        self.kinds.append(kind)
-        self.means.append(np.asarray(mean, np.float64))
-
-    def upload(self, device: str) -> TextureTables:
-        tables = TextureTables()
-        tables.records = _struct_array(TextureRecord, self.records, device)
-        tables.bytes = wp.array(np.concatenate(self.bytes) if self.bytes else np.zeros(0, np.uint8), device=device)
-        tables.floats = wp.array(
-            np.concatenate(self.floats) if self.floats else np.zeros(0), dtype=wp.float32, device=device
-        )
-        tables.srgb_to_linear = wp.array(srgb_to_linear(np.arange(256) / 255.0), dtype=wp.float32, device=device)
-        return tables
-
-
-def _rgb(value) -> np.ndarray:
-    return np.broadcast_to(np.asarray(value, np.float64), 3)
-
-
-def _relative_ior(bsdf) -> float:
-    interior, exterior = (
-        INDEX_OF_REFRACTION[value] if isinstance(value, str) else value for value in (bsdf.int_ior, bsdf.ext_ior)
-    )
-    return interior / exterior
-
-
 class _Upload:
     def __init__(self, scene: description.Scene, device: str):
         self.scene, self.device = scene, device
-        self.atlas = _TextureAtlas()
-        self.materials: list[dict] = []
-        self.bsdfs: dict[str, list[dict]] = {
-            "diffuse": [],
-            "conductor": [],
-            "dielectric": [],
-            "plastic": [],
-            "oren_nayar": [],
-        }
-        self.coatings: list[np.ndarray] = []
-        self.bsdf_kinds: set[str] = set()
-        self.known_materials: dict[int, int] = {}
-        self.mask = False
+        self.atlas = TextureAtlas()
+        self.materials = MaterialUpload(scene, self.atlas)
         self.emitters: list[dict] = []
         self.light_texture_kinds: set[str] = set()
         self.keep_alive: list = []
@@ -186,119 +67,25 @@ class _Upload:
         luminances = [self._mean_luminance(emitter) for emitter in range(len(self.emitters))]
         upload = LightUpload(self.scene, self.emitters, luminances, self.device, self.notes)
         lights, light_kinds = upload.run(meshes, spheres, bounds)
-        lights.emitters = _struct_array(EmitterRecord, self.emitters, self.device)
-        geometry.shapes = _struct_array(Shape, self.shape_records, self.device)
-        materials = bsdf_tables.MaterialTables()
-        materials.materials = _struct_array(bsdf_tables.Material, self.materials, self.device)
-        materials.diffuse = _struct_array(bsdf_tables.DiffuseRecord, self.bsdfs["diffuse"], self.device)
-        materials.conductor = _struct_array(bsdf_tables.ConductorRecord, self.bsdfs["conductor"], self.device)
-        materials.dielectric = _struct_array(bsdf_tables.DielectricRecord, self.bsdfs["dielectric"], self.device)
-        materials.plastic = _struct_array(bsdf_tables.PlasticRecord, self.bsdfs["plastic"], self.device)
-        materials.oren_nayar = _struct_array(bsdf_tables.OrenNayarRecord, self.bsdfs["oren_nayar"], self.device)
-        coatings = np.concatenate([np.zeros(0), *self.coatings])
-        materials.coatings = wp.array(coatings, dtype=wp.float32, device=self.device)
+        lights.emitters = struct_array(EmitterRecord, self.emitters, self.device)
+        geometry.shapes = struct_array(Shape, self.shape_records, self.device)
         return DeviceScene(
             geometry=geometry,
-            materials=materials,
+            materials=self.materials.upload(self.device),
             textures=self.atlas.upload(self.device),
             lights=lights,
             triangle_count=geometry.triangle_count,
             sphere_count=len(spheres),
             light_count=lights.lights.shape[0],
             smooth=any(mesh.normals is not None for _, mesh, _ in meshes),
-            bsdfs=tuple(sorted(self.bsdf_kinds)),
-            mask=self.mask,
+            bsdfs=tuple(sorted(self.materials.kinds)),
+            mask=self.materials.mask,
             texture_kinds=tuple(sorted(set(self.atlas.kinds))),
             light_kinds=light_kinds,
             light_texture_kinds=tuple(sorted(self.light_texture_kinds)),
             keep_alive=self.keep_alive,
             notes=self.notes,
         )
-
-    # --- materials -------------------------------------------------------------------------------------------------
-
-    def _parameter(self, value, where: str, scalar: bool = False) -> tuple[object, int]:
-        """Value and texture index (-1: none) of a parameter."""
-        value = resolve_texture(self.scene, value)
-        if isinstance(value, (description.Bitmap, description.Checkerboard)):
-            return (1.0 if scalar else np.ones(3)), self.atlas.add(value, where, scalar)
-        return (float(value) if scalar else _rgb(value)), -1
-
-    def _set(self, record: dict, name: str, value, where: str, scalar: bool = False):
-        record[name], record[f"{name}_texture"] = self._parameter(value, where, scalar)
-
-    def _material(self, ref, where: str) -> int:
-        """Index of the material of a BSDF record; the same record is stored once."""
-        bsdf = resolve_bsdf(self.scene, ref)
-        if id(bsdf) in self.known_materials:
-            return self.known_materials[id(bsdf)]
-        material = {"opacity": 1.0, "opacity_texture": -1}
-        inner = bsdf
-        if isinstance(inner, description.Mask):
-            self._set(material, "opacity", inner.opacity, f"{where}.opacity", scalar=True)
-            self.mask = True
-            inner, where = resolve_bsdf(self.scene, inner.bsdf), f"{where}.bsdf"
-        if isinstance(inner, description.TwoSided):
-            front = resolve_bsdf(self.scene, inner.front)
-            back = front if inner.back is None else resolve_bsdf(self.scene, inner.back)
-            sides = [self._bsdf(front, f"{where}.front")]
-            sides.append(sides[0] if back is front else self._bsdf(back, f"{where}.back"))
-        else:
-            front = self._bsdf(inner, where)
-            transmits = BSDF_KINDS[type(inner)] in bsdf_tables.TRANSMISSIVE
-            sides = [front, front if transmits else (int(bsdf_tables.KIND_NONE), 0)]
-        (material["front"], material["front_index"]), (material["back"], material["back_index"]) = sides
-        self.materials.append(material)
-        self.known_materials[id(bsdf)] = len(self.materials) - 1
-        self.keep_alive.append(bsdf)  # the id stays taken
-        return len(self.materials) - 1
-
-    def _bsdf(self, bsdf: description.Bsdf, where: str) -> tuple[int, int]:
-        """Kind and record index of a BSDF that is neither two-sided nor a mask."""
-        kind = BSDF_KINDS[type(bsdf)]
-        self.bsdf_kinds.add(kind)
-        if kind == "null":
-            return bsdf_tables.KINDS[kind], 0  # has no parameters, hence no record
-        record: dict = {}
-        if kind == "diffuse":
-            table = "diffuse"
-            self._set(record, "reflectance", bsdf.reflectance, f"{where}.reflectance")
-        elif kind == "oren_nayar":
-            table = "oren_nayar"
-            self._set(record, "reflectance", bsdf.reflectance, f"{where}.reflectance")
-            self._set(record, "roughness", bsdf.roughness, f"{where}.roughness", scalar=True)
-        elif kind in ("conductor", "rough_conductor"):
-            table = "conductor"
-            eta, k = CONDUCTORS[bsdf.material] if bsdf.material is not None else (bsdf.eta, bsdf.k)
-            eta, k = (0.0, 1.0) if eta is None else (eta, k)  # a perfect mirror
-            self._set(record, "eta", eta, f"{where}.eta")
-            self._set(record, "k", k, f"{where}.k")
-            self._set(record, "reflectance", bsdf.specular_reflectance, f"{where}.specular_reflectance")
-        elif kind in ("plastic", "rough_plastic"):
-            table = "plastic"
-            record["eta"] = _relative_ior(bsdf)
-            record["nonlinear"] = int(bsdf.nonlinear)
-            self._set(record, "diffuse", bsdf.diffuse_reflectance, f"{where}.diffuse_reflectance")
-            self._set(record, "reflectance", bsdf.specular_reflectance, f"{where}.specular_reflectance")
-            if kind == "plastic":
-                record["internal_reflectance"] = diffuse_fresnel(1.0 / record["eta"])
-            else:
-                record["alpha"], record["distribution"] = bsdf.alpha, DISTRIBUTIONS[bsdf.distribution]
-                transmittance, record["internal_reflectance"] = rough_coating(
-                    record["eta"], bsdf.alpha, record["distribution"]
-                )
-                record["first"] = sum(part.size for part in self.coatings)
-                self.coatings.append(transmittance)
-        else:
-            table = "dielectric"
-            record["eta"] = _relative_ior(bsdf)
-            self._set(record, "reflectance", bsdf.specular_reflectance, f"{where}.specular_reflectance")
-            self._set(record, "transmittance", bsdf.specular_transmittance, f"{where}.specular_transmittance")
-        if kind in ("rough_conductor", "rough_dielectric"):
-            self._set(record, "alpha", bsdf.alpha, f"{where}.alpha", scalar=True)
-            record["distribution"] = DISTRIBUTIONS[bsdf.distribution]
-        self.bsdfs[table].append(record)
-        return bsdf_tables.KINDS[kind], len(self.bsdfs[table]) - 1
 
     # --- geometry --------------------------------------------------------------------------------------------------
 
@@ -308,7 +95,7 @@ class _Upload:
         for i, shape in enumerate(self.scene.shapes):
             where = f"shapes[{i}]"
             emitter = self._emitter(shape.emitter, where) if shape.emitter is not None else -1
-            record = {"material": self._material(shape.bsdf, f"{where}.bsdf"), "first_light": -1}
+            record = {"material": self.materials.add(shape.bsdf, f"{where}.bsdf"), "first_light": -1}
             record["two_sided"] = int(shape.emitter is not None and shape.emitter.two_sided)
             if isinstance(shape, description.Sphere):
                 matrix = to_matrix(shape.to_world, f"{where}.to_world")
@@ -374,7 +161,8 @@ class _Upload:
 
     def _emitter(self, area: description.Area, where: str) -> int:
         record: dict = {}
-        self._set(record, "radiance", area.radiance, f"{where}.emitter.radiance")
+        radiance = self.atlas.parameter(self.scene, area.radiance, f"{where}.emitter.radiance")
+        record["radiance"], record["radiance_texture"] = radiance
         if record["radiance_texture"] >= 0:
             self.light_texture_kinds.add(self.atlas.kinds[record["radiance_texture"]])
         self.emitters.append(record)

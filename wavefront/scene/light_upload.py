@@ -15,6 +15,7 @@ from wavefront.light import tables
 from wavefront.light.envmap import EnvironmentMap, cell_weights, quantized_cdf
 from wavefront.scene import description
 from wavefront.scene.images import load_image
+from wavefront.scene.texture_upload import rgb
 from wavefront.scene.transforms import to_matrix
 from wavefront.texture import srgb_to_linear
 
@@ -69,7 +70,7 @@ class LightUpload:
             elif isinstance(emitter, (description.Point, description.Spot)):
                 self._point(emitter)
             elif isinstance(emitter, description.Directional):
-                self._distant("directional", emitter.direction, 0.0, _rgb(emitter.irradiance), cross_section)
+                self._distant("directional", emitter.direction, 0.0, rgb(emitter.irradiance), cross_section)
         self.tables.first_sun = self.count
         for emitter in self.scene.emitters:
             if isinstance(emitter, description.Sun):
@@ -107,7 +108,7 @@ class LightUpload:
     # --- environments ------------------------------------------------------------------------------------------------
 
     def _constant(self, emitter: description.Constant, cross_section: float) -> None:
-        radiance = _rgb(emitter.radiance)
+        radiance = rgb(emitter.radiance)
         self.emitters.append({"radiance": radiance, "radiance_texture": -1})
         power = cross_section * 4.0 * np.pi * _luminance(radiance)
         self.tables.environment = self._add("constant", power, len(self.emitters) - 1)
@@ -140,7 +141,7 @@ class LightUpload:
 
     def _point(self, emitter: description.Point | description.Spot) -> None:
         record = tables.PointRecord()
-        intensity = _rgb(emitter.intensity)
+        intensity = rgb(emitter.intensity)
         record.position, record.intensity = wp.vec3(*emitter.position), wp.vec3(*intensity)
         power = 4.0 * np.pi * _luminance(intensity)
         if isinstance(emitter, description.Spot):
@@ -166,9 +167,9 @@ class LightUpload:
         # Irradiance of a disc of radiance 1: the integral of the cosine over the cone, pi sin^2(angle).
         projected = np.pi * np.sin(2.0 * half) ** 2
         if emitter.radiance is not None:
-            radiance = _rgb(emitter.radiance)
+            radiance = rgb(emitter.radiance)
         else:
-            radiance = _rgb(1.0 if emitter.irradiance is None else emitter.irradiance) / projected
+            radiance = rgb(1.0 if emitter.irradiance is None else emitter.irradiance) / projected
         self._distant("sun", emitter.direction, 2.0 * np.sin(half) ** 2, radiance, cross_section * projected)
 
 
@@ -198,9 +199,5 @@ def _load_envmap(file: str, where: str, notes: list[str]) -> np.ndarray:
     return pixels
 
 
-def _rgb(value) -> np.ndarray:
-    return np.broadcast_to(np.asarray(value, np.float64), 3)
-
-
-def _luminance(rgb: np.ndarray) -> float:
-    return float(rgb @ np.asarray(LUMINANCE))
+def _luminance(color: np.ndarray) -> float:
+    return float(color @ np.asarray(LUMINANCE))
