@@ -1,6 +1,6 @@
 """Images against Mitsuba 3, an independent renderer, of the same XML files.
 
-Every comparison has two parts (see `tests.image_test`): no tile differs, at a false alarm rate of 1e-4 for the whole
+Every comparison has two parts (see `tools.image_test`): no tile differs, at a false alarm rate of 1e-4 for the whole
 image, and the 95 % confidence interval of the ratio of image means lies within 1 ± 0.005. Samples are taken until the
 ratio is known to 0.1 %, so a difference of 0.4 % in the mean, or of a few percent in one tile, fails.
 
@@ -13,7 +13,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +21,8 @@ import pytest
 from scipy import stats
 
 from tests import mitsuba_scenes as scenes
-from tests.image_test import RATIO_TOLERANCE, ROUNDING, Comparison, Estimate, collect, compare
-from wavefront.renderer import Renderer
+from tools.image_test import RATIO_TOLERANCE, Comparison, Estimate, collect, compare
+from tools.peers.images import like_the_peer, our_batches, rounding_of, their_batches
 from wavefront.scene import description, load_scene
 
 mi = pytest.importorskip("mitsuba")
@@ -53,32 +52,6 @@ def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("scenes")
     scenes.write_files(path)
     return path
-
-
-def our_batches(scene: description.Scene, spp: int, name: str):
-    """Means of consecutive samples of one render, which are independent; so are renders of different names."""
-    renderer = Renderer(scene, seed=zlib.crc32(name.encode()))
-    before = np.zeros(1)
-    while True:
-        renderer.render(spp=spp)
-        assert not any(renderer.statistics.nonfinite.values()), renderer.statistics.nonfinite
-        total = renderer.film.arrays.L.numpy().copy()  # float64 sums
-        yield ((total - before) / spp).reshape(renderer.film.height, renderer.film.width, 3)
-        before = total
-
-
-def their_batches(scene, max_depth: int, spp: int, seed: int = 0):
-    """Means of renders with seeds from `seed` on."""
-    while True:
-        yield peer.render(scene, spp, seed, max_depth)
-        seed += 1
-
-
-def like_the_peer(scene: description.Scene, width: int, height: int, max_depth: int, nee: bool = True):
-    """The scene with a film and an integrator as the peer has them."""
-    scene.film = description.Film(width=width, height=height)
-    scene.integrator = description.PathIntegrator(max_depth=max_depth, rr_depth=None, nee=nee)
-    return scene
 
 
 def compare_xml(name: str, path: Path, size: tuple[int, int], max_depth: int, spp: int, tiles, nee=True, **settings):
@@ -195,10 +168,6 @@ def test_own_scene(path):
 
 # --- real scenes -------------------------------------------------------------------------------------------------
 
-# Light from a small sphere far away: on the floor of veach-mis, that of the sphere of radius 0.05 is 0.06 to 0.17 %
-# more in Mitsuba 3.9 than in closed form, from which ours differs by 0.003 %; tiles of the two differ by up to 0.26 %.
-ROUNDINGS = {"veach-mis": 0.004}
-
 # File, size, depth, samples per batch. Films are large and batches of few samples: a pixel is a stratum, and the edges
 # of small bright lights make most of the noise.
 REAL = {
@@ -215,7 +184,7 @@ REAL = {
 def test_real_scene(name):
     file, size, max_depth, spp = REAL[name]
     tiles = (9, 16) if size[0] * 9 == size[1] * 16 else (8, 8)
-    settings = {"most": 1024, "rounding": ROUNDINGS.get(name, ROUNDING)}
+    settings = {"most": 1024, "rounding": rounding_of(name)}
     check(name, compare_xml(name, Path(REAL_SCENES) / file, size, max_depth, spp, tiles, **settings))
 
 
