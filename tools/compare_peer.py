@@ -327,7 +327,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit status: 0, 1 where a scene differs, or 2 after an error, of which one line says all."""
+    """Entry point; returns the exit status: 0, 1 where a scene differs, or 2 after an error."""
     try:
         return run(build_parser().parse_args(argv))
     except (WavefrontError, OSError) as error:
