@@ -17,12 +17,19 @@ CHUNK_SECONDS = 1.0  # of one call of the peer: long enough that its start does 
 
 
 def prepared(job: dict):
-    """Our records for a job: its film with a box filter, its depth, no Russian roulette, light sampling."""
+    """Our records for a job: its film with a box filter, its depth, no Russian roulette, light sampling.
+
+    A job with ``everything`` gets kernels for every feature, see `tools.every_feature`.
+    """
     from wavefront.scene import description, load_scene
 
     scene = load_scene(job["scene"])
     scene.film = description.Film(width=job["width"], height=job["height"])
     scene.integrator = description.PathIntegrator(max_depth=job["max_depth"], rr_depth=None)
+    if job.get("everything"):
+        from tools.every_feature import with_every_feature
+
+        with_every_feature(scene)
     return scene
 
 
