@@ -17,7 +17,7 @@ from wavefront.accel.mesh_query import INFINITE, Geometry, make_intersector
 from wavefront.bsdf.dispatch import is_smooth, make_bsdf
 from wavefront.bsdf.tables import KINDS as BSDF_KINDS
 from wavefront.bsdf.tables import MaterialTables
-from wavefront.camera import Camera, camera_ray, make_camera
+from wavefront.camera import Camera, camera_kind, make_camera, make_camera_ray
 from wavefront.light.envmap import make_envmap
 from wavefront.light.sampling import make_light_sampler
 from wavefront.light.tables import KIND_CONSTANT, KIND_ENVMAP_FLOATS, LightTables
@@ -48,8 +48,9 @@ class Settings:
 
 
 @functools.cache
-def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool, nee: bool):
+def make_megakernel(camera_kind: str, triangles: bool, spheres: bool, smooth: bool, uvs: bool, nee: bool):
     """Only what a scene lacks memory for is left out: kinds of primitive, vertex normals, UVs, tables of sampling."""
+    camera_ray = make_camera_ray(camera_kind)
     closest_hit, occluded = make_intersector(triangles, spheres)
     vertex_of = make_vertex(triangles, spheres, smooth, uvs)
     eval_bsdf, sample_bsdf, _ = make_bsdf(tuple(sorted(BSDF_KINDS)), True, TEXTURES)
@@ -82,8 +83,9 @@ def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool, nee
             shift = settings.filter_scale * square_to_gaussian(wp.vec2(u[0], u[1]))
         x = float(pixel % settings.width) + 0.5 + shift[0]
         y = float(pixel // settings.width) + 0.5 + shift[1]
-        origin = camera.origin
-        direction = camera_ray(camera, x, y)
+        ray = camera_ray(camera, x, y, wp.vec2(u[2], u[3]))
+        origin = ray.origin
+        direction = ray.direction
 
         L = wp.vec3(0.0)
         beta = wp.vec3(1.0)
@@ -188,7 +190,7 @@ def render_megakernel(renderer: Renderer, spp: int) -> np.ndarray:
     settings.seed = renderer.seed
     n = film.width * film.height * spp
     result = wp.zeros(n, dtype=wp.vec3, device="cpu")
-    kernel = make_megakernel(f.triangles, f.spheres, f.smooth, f.uvs, f.nee)
+    kernel = make_megakernel(camera_kind(scene.camera), f.triangles, f.spheres, f.smooth, f.uvs, f.nee)
     d = device_scene
     inputs = [make_camera(scene.camera, film), d.geometry, d.materials, d.textures, d.lights, settings]
     wp.launch(kernel, dim=n, inputs=inputs, outputs=[result], device="cpu")

@@ -9,6 +9,7 @@ import warp as wp
 
 from wavefront.bsdf.tables import KINDS
 from wavefront.features import Features
+from wavefront.film import FIRST_HIT
 from wavefront.integrator import make_kernels
 
 CORNELL_BOX = Features(
@@ -23,6 +24,7 @@ CORNELL_BOX = Features(
     light_textures=(),
     nee=True,
     roulette=True,
+    camera="perspective",
     filter="box",
     aovs=(),
     variance=False,
@@ -39,8 +41,9 @@ EVERYTHING = Features(
     light_textures=("bytes", "checkerboard", "floats"),
     nee=True,
     roulette=True,
+    camera="perspective",
     filter="gaussian",
-    aovs=("albedo", "depth", "normal"),
+    aovs=FIRST_HIT,
     variance=True,
 )
 CHANGES = [
@@ -56,6 +59,8 @@ CHANGES = [
     {"nee": False, "filter": "tent", "mask": False},
     {"bsdfs": ("conductor",), "roulette": False, "filter": "box"},
     {"bsdfs": ("dielectric",), "aovs": ("albedo",), "variance": False},
+    {"camera": "thin_lens"},
+    {"camera": "orthographic", "aovs": ("shape_index",)},
 ]
 
 

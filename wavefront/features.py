@@ -17,7 +17,7 @@ class Features:
     triangles: bool  # some shape is a mesh
     spheres: bool
     smooth: bool  # some mesh has vertex normals
-    uvs: bool  # some texture is looked up
+    uvs: bool  # some texture is looked up, or UVs are asked for
 
     # Materials
     bsdfs: tuple[str, ...]  # kinds, sorted
@@ -28,11 +28,12 @@ class Features:
     lights: tuple[str, ...]  # kinds, sorted; empty if nothing emits
     light_textures: tuple[str, ...]  # kinds of texture that emitters have
 
-    # Integrator and film
+    # Integrator, camera and film
     nee: bool
     roulette: bool
+    camera: str
     filter: str
-    aovs: tuple[str, ...]  # of the first hit
+    aovs: tuple[str, ...]  # arrays of the film that the first hit adds to, sorted
     variance: bool
 
     @property

@@ -2,8 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+
 import numpy as np
 import warp as wp
+
+from wavefront.scene import description
+
+# Channels by AOV. The EXR name of a channel is that of its AOV, a point and this.
+CHANNELS = {
+    "albedo": "RGB",
+    "normal": "XYZ",
+    "geometric_normal": "XYZ",
+    "depth": "Z",
+    "position": "XYZ",
+    "uv": "UV",
+    "shape_index": "I",
+    "bsdf_index": "I",
+    "sample_count": "I",
+    "variance": "Y",
+}
+INTEGERS = ("shape_index.I", "bsdf_index.I", "sample_count.I")  # channels that 16-bit floats would round
+BLOCK_PIXELS = 1 << 18  # of a film that is turned into an image block by block
 
 
 @wp.struct
@@ -14,10 +34,31 @@ class FilmArrays:
     luminance_squared: wp.array[wp.float64]
     albedo: wp.array[wp.vec3d]
     normal: wp.array[wp.vec3d]
+    geometric_normal: wp.array[wp.vec3d]
     depth: wp.array[wp.float64]
+    position: wp.array[wp.vec3d]
+    uv: wp.array[wp.vec2d]
+    shape_index: wp.array[wp.int32]  # of the first sample, not a sum; -1 where its ray escaped
 
+
+# The array that an AOV is made of; `sample_count` needs none.
+_ARRAYS = {aov: aov for aov in CHANNELS if aov in FilmArrays.vars} | {
+    "bsdf_index": "shape_index",
+    "variance": "luminance_squared",
+}
+# Arrays that the first hit of a camera ray adds to.
+FIRST_HIT = tuple(sorted(set(_ARRAYS.values()) - {"luminance_squared"}))
 
 LUMINANCE = (0.212671, 0.715160, 0.072169)  # Y of linear Rec. 709 primaries with a D65 white point
+
+
+@wp.struct
+class FilmWindow:
+    """The pixels that are rendered, in the whole film."""
+
+    film_width: wp.int32
+    x: wp.int32
+    y: wp.int32
 
 
 @wp.func
@@ -25,37 +66,83 @@ def luminance(L: wp.vec3) -> float:
     return 0.212671 * L[0] + 0.715160 * L[1] + 0.072169 * L[2]
 
 
+def make_window(film: description.Film) -> FilmWindow:
+    """The device record of a film's window."""
+    window = FilmWindow()
+    window.film_width, window.x, window.y = film.width, film.window.x, film.window.y
+    return window
+
+
+def film_arrays(aovs: tuple[str, ...]) -> tuple[str, ...]:
+    """Arrays, beside that of the radiance, that some AOVs need, sorted."""
+    return tuple(sorted({_ARRAYS[aov] for aov in aovs if aov in _ARRAYS}))
+
+
+def row_blocks(width: int, height: int) -> Iterator[tuple[int, int]]:
+    """First row and row after the last of blocks that cover an image from the top, of whole EXR chunks if possible."""
+    rows = max(1, BLOCK_PIXELS // width)
+    rows = rows // 16 * 16 or rows
+    for first in range(0, height, rows):
+        yield first, min(height, first + rows)
+
+
 class Film:
     """Sums of a render and the number of samples in them.
 
     Args:
-        width, height: Pixels.
-        aovs: Subset of ``("albedo", "depth", "normal", "variance")``.
+        width, height: Pixels that are rendered.
+        aovs: Subset of the keys of `CHANNELS`.
         device: Warp device.
+        bsdf_of_shape: Index of the BSDF of each shape; needed for ``bsdf_index``.
     """
 
-    def __init__(self, width: int, height: int, aovs: tuple[str, ...], device: str):
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        aovs: tuple[str, ...],
+        device: str,
+        bsdf_of_shape: Sequence[int] = (),
+    ):
         self.width, self.height, self.aovs = width, height, aovs
+        self.bsdf_of_shape = bsdf_of_shape
         self.sample_count = 0
         self.arrays = FilmArrays()
-        fields = {"L", *aovs} - {"variance"} | ({"luminance_squared"} if "variance" in aovs else set())
-        for name in fields:
+        for name in ("L", *film_arrays(aovs)):
             dtype = FilmArrays.vars[name].type.dtype
             setattr(self.arrays, name, wp.zeros(width * height, dtype=dtype, device=device))
 
     @staticmethod
     def bytes_per_pixel(aovs: tuple[str, ...]) -> int:
         """Memory that one pixel of the film takes."""
-        return 24 + sum({"albedo": 24, "normal": 24, "depth": 8, "variance": 8}[aov] for aov in aovs)
+        dtypes = (FilmArrays.vars[name].type.dtype for name in ("L", *film_arrays(aovs)))
+        return sum(wp.types.type_size_in_bytes(dtype) for dtype in dtypes)
 
-    def _mean(self, name: str) -> np.ndarray:
-        sums = getattr(self.arrays, name).numpy()
-        shape = (self.height, self.width, 3) if sums.ndim == 2 else (self.height, self.width)
-        return sums.reshape(shape) / max(self.sample_count, 1)
+    def _rows(self, name: str, first: int, last: int) -> np.ndarray:
+        """Rows of an array, on the host: [rows, width] or [rows, width, components]."""
+        values = getattr(self.arrays, name)[first * self.width : last * self.width].numpy()
+        return values.reshape(last - first, self.width, *values.shape[1:])
+
+    def _mean(self, name: str, first: int, last: int) -> np.ndarray:
+        return self._rows(name, first, last) / max(self.sample_count, 1)
+
+    def _whole(self, rows) -> np.ndarray:
+        """An image from the function that gives its rows, without copies of the whole film in between."""
+        image = None
+        for first, last in row_blocks(self.width, self.height):
+            block = rows(first, last)
+            if image is None:
+                image = np.empty((self.height, *block.shape[1:]), np.float32)
+            image[first:last] = block
+        return image
+
+    def image_rows(self, first: int, last: int) -> np.ndarray:
+        """Rows of `image`: [rows, width, 3], float32."""
+        return self._mean("L", first, last).astype(np.float32)
 
     def image(self) -> np.ndarray:
         """Mean radiance, shape [height, width, 3], float32, linear Rec. 709."""
-        return self._mean("L").astype(np.float32)
+        return self._whole(self.image_rows)
 
     def variance(self) -> np.ndarray:
         """Estimated variance of the mean luminance of each pixel, shape [height, width], float32; NaN for one sample.
@@ -63,23 +150,39 @@ class Film:
         Sample variance over n, from the sums of y and y^2 in float64, which leaves some nine digits after the
         subtraction for a pixel whose samples differ by one part in a thousand.
         """
-        n = self.sample_count
-        mean = self._mean("L") @ np.asarray(LUMINANCE)
-        if n < 2:
-            return np.full(mean.shape, np.nan, np.float32)
-        return (np.maximum(self._mean("luminance_squared") - mean * mean, 0.0) / (n - 1)).astype(np.float32)
+        return self._whole(self._variance)
 
-    def channels(self) -> dict[str, np.ndarray]:
-        """All channels by their EXR names, each [height, width], float32."""
-        image = self.image()
+    def _variance(self, first: int, last: int) -> np.ndarray:
+        n = self.sample_count
+        mean = self._mean("L", first, last) @ np.asarray(LUMINANCE)
+        if n < 2:
+            return np.full(mean.shape, np.nan)
+        return np.maximum(self._mean("luminance_squared", first, last) - mean * mean, 0.0) / (n - 1)
+
+    def _aov(self, aov: str, first: int, last: int) -> np.ndarray:
+        if aov == "variance":
+            return self._variance(first, last)
+        if aov == "sample_count":
+            return np.full((last - first, self.width), self.sample_count)
+        if aov in ("shape_index", "bsdf_index"):
+            shape = self._rows("shape_index", first, last)
+            return shape if aov == "shape_index" else np.append(self.bsdf_of_shape, -1)[shape]
+        return self._mean(aov, first, last)
+
+    def rows(self, first: int, last: int) -> dict[str, np.ndarray]:
+        """All channels by their EXR names, of the rows from `first` to before `last`: [rows, width], float32.
+
+        Means over the samples of a pixel, to which a ray that escapes adds zero; but indices are those of the first
+        sample, -1 where its ray escaped.
+        """
+        image = self.image_rows(first, last)
         channels = {name: image[..., i] for i, name in enumerate("RGB")}
         for aov in self.aovs:
-            if aov == "variance":
-                channels["variance.Y"] = self.variance()
-            elif aov == "depth":
-                channels["depth.Z"] = self._mean("depth").astype(np.float32)
-            else:
-                values = self._mean(aov).astype(np.float32)
-                for i, name in enumerate("RGB" if aov == "albedo" else "XYZ"):
-                    channels[f"{aov}.{name}"] = values[..., i]
+            values = np.atleast_3d(self._aov(aov, first, last).astype(np.float32))
+            channels |= {f"{aov}.{name}": values[..., i] for i, name in enumerate(CHANNELS[aov])}
         return channels
+
+    def channels(self) -> dict[str, np.ndarray]:
+        """All channels of the film as `rows` gives them, each [height, width], float32."""
+        blocks = [self.rows(first, last) for first, last in row_blocks(self.width, self.height)]
+        return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}

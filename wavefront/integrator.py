@@ -17,10 +17,10 @@ import numpy as np
 import warp as wp
 
 from wavefront import queues
-from wavefront.camera import make_camera
+from wavefront.camera import camera_kind, make_camera
 from wavefront.errors import WavefrontError
 from wavefront.features import Features
-from wavefront.film import Film
+from wavefront.film import FIRST_HIT, Film, film_arrays, make_window
 from wavefront.queues import Paths, QueueSet, ShadowRays, Surfaces, allocate_struct, bytes_per_slot
 from wavefront.scene import description
 from wavefront.scene.device import DeviceScene
@@ -49,7 +49,7 @@ def make_features(scene: description.Scene, device_scene: DeviceScene) -> Featur
         triangles=device_scene.triangle_count > 0,
         spheres=device_scene.sphere_count > 0,
         smooth=device_scene.smooth,
-        uvs=bool(device_scene.texture_kinds),
+        uvs=bool(device_scene.texture_kinds) or "uv" in scene.film.aovs,
         bsdfs=device_scene.bsdfs,
         mask=device_scene.mask,
         textures=device_scene.texture_kinds,
@@ -57,8 +57,9 @@ def make_features(scene: description.Scene, device_scene: DeviceScene) -> Featur
         light_textures=device_scene.light_texture_kinds,
         nee=integrator.nee,
         roulette=integrator.rr_depth is not None and integrator.rr_depth < integrator.max_depth,
+        camera=camera_kind(scene.camera),
         filter=filter_kind(scene.film),
-        aovs=tuple(sorted(set(scene.film.aovs) - {"variance"})),
+        aovs=tuple(name for name in film_arrays(tuple(scene.film.aovs)) if name in FIRST_HIT),
         variance="variance" in scene.film.aovs,
     )
 
@@ -87,8 +88,10 @@ class Kernels:
 def make_kernels(f: Features) -> Kernels:
     """Kernels for a set of features; scenes that agree in what a stage reads share its kernel."""
     return Kernels(
-        generate=make_generate(f.filter, f.transmission),
-        intersect=make_intersect(f.triangles, f.spheres, f.smooth, f.uvs, f.area_lights, bool(f.escape_lights)),
+        generate=make_generate(f.camera, f.filter, f.transmission),
+        intersect=make_intersect(
+            f.triangles, f.spheres, f.smooth, f.uvs, f.area_lights, bool(f.escape_lights), "shape_index" in f.aovs
+        ),
         escaped=make_escaped(f.escape_lights, f.light_sampling) if f.escape_lights else None,
         emission=make_emission(f.lights, f.light_textures, f.light_sampling) if f.area_lights else None,
         aov=make_aov(f.aovs, f.bsdfs, f.mask, f.textures, f.uvs) if f.aovs else None,
@@ -107,7 +110,9 @@ def skipped_arrays(f: Features) -> dict[type, tuple[str, ...]]:
     """Arrays of the path state that the features do without."""
     return {
         Paths: () if f.transmission else ("eta",),
-        Surfaces: (() if f.uvs else ("uv",)) + (() if f.area_lights else ("light",)),
+        Surfaces: (() if f.uvs else ("uv",))
+        + (() if f.area_lights else ("light",))
+        + (() if "shape_index" in f.aovs else ("shape",)),
         ShadowRays: () if f.light_sampling else tuple(ShadowRays.vars),
     }
 
@@ -167,14 +172,14 @@ class Worker:
         textures, lights = device_scene.textures, device_scene.lights
         rays, hits, escaped, emissive, shadow = (self.queues[name] for name in QueueSet.INDEX)
         counters, totals, tile = self.queues.counters, self.queues.totals, self.tile
-        camera = make_camera(scene.camera, scene.film)
+        camera, window = make_camera(scene.camera, scene.film), make_window(scene.film)
         scale = FILTER_SCALES[features.filter](scene.film.filter)
         max_depth, rr_depth = scene.integrator.max_depth, scene.integrator.rr_depth or 0
         width, sums, seed = film.width, film.arrays, wp.uint64(seed)
         tables = geometry, materials, textures, lights
         # In the order of the kernels' parameters.
         arguments = {
-            "generate": [camera, tile, width, scale, seed, paths, rays, counters, totals],
+            "generate": [camera, tile, window, scale, seed, paths, rays, counters, totals],
             "intersect": [geometry, paths, rays, max_depth, surfaces, hits, escaped, emissive, counters],
             "escaped": [lights, paths, escaped, counters],
             "emission": [geometry, lights, textures, paths, surfaces, emissive, counters],

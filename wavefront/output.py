@@ -16,9 +16,10 @@ import warp as wp
 
 import wavefront
 from wavefront.errors import WavefrontError
+from wavefront.film import INTEGERS, Film, row_blocks
 from wavefront.renderer import Renderer, peak_memory_bytes
 from wavefront.scene import description
-from wavefront.scene.images import HalfOverflowError, replacing, write_exr, write_png
+from wavefront.scene.images import HalfOverflowError, replacing, write_exr_blocks, write_png_blocks
 from wavefront.scene.lookup import walk
 
 
@@ -140,11 +141,58 @@ def describe_render(renderer: Renderer, source: str, started: float) -> dict:
         "triangles": renderer.device_scene.triangle_count,
         "spheres": renderer.device_scene.sphere_count,
         "lights": renderer.device_scene.light_count,
+        "bytes_per_pixel": renderer.bytes_per_pixel,
         "bytes_per_path": renderer.bytes_per_path,
         "paths_in_flight": renderer.capacity * renderer.threads,
         "peak_memory_bytes": peak_memory_bytes(),
         "warnings": renderer.warnings,
     }
+
+
+def exr_attributes(renderer: Renderer, account: dict) -> dict[str, int | float | str]:
+    """What the header of OUT.exr says of the render.
+
+    ``samplesPerPixel`` (int), ``seed`` (text: it has 64 bits), ``sceneSHA256``, ``software`` and ``pixelAspectRatio``.
+    """
+    return {
+        "samplesPerPixel": renderer.sample_count,
+        "seed": str(renderer.seed),
+        "sceneSHA256": account["scene_sha256"],
+        "Software": f"wavefront {wavefront.__version__}",
+        "PixelAspectRatio": renderer.scene.film.pixel_aspect,
+    }
+
+
+def write_film(exr: Path, renderer: Renderer, half: bool, account: dict) -> None:
+    """Writes the channels of the film, from the film itself in blocks of rows.
+
+    Indices and counts are 32-bit floats whatever `half` says.
+
+    Raises:
+        HalfOverflowError: A finite value beyond 65504 in half precision.
+        WavefrontError: The file cannot be written.
+    """
+    film, record = renderer.film, renderer.scene.film
+    names = film.rows(0, 1)
+    write_exr_blocks(
+        exr,
+        (record.window.x, record.window.y, film.width, film.height),
+        (record.width, record.height),
+        {name: "half" if half and name not in INTEGERS else "float" for name in names},
+        (film.rows(first, last) for first, last in row_blocks(film.width, film.height)),
+        exr_attributes(renderer, account),
+    )
+
+
+def write_picture(png: Path, film: Film, exposure: float) -> None:
+    """Writes the film for the eye, in blocks of rows.
+
+    Raises:
+        WavefrontError: The file cannot be written.
+    """
+    blocks = row_blocks(film.width, film.height)
+    pictures = (tone_map(film.image_rows(first, last), exposure) for first, last in blocks)
+    write_png_blocks(png, (film.height, film.width, 3), pictures)
 
 
 def write_outputs(exr: Path, renderer: Renderer, exposure: float, account: dict) -> None:
@@ -155,14 +203,13 @@ def write_outputs(exr: Path, renderer: Renderer, exposure: float, account: dict)
             there in 32-bit floats all the same.
     """
     exr, png, account_path = output_paths(exr)
-    channels = renderer.film.channels()
     overflow = None
     try:
-        write_exr(exr, channels, half=renderer.scene.film.precision == "half")
+        write_film(exr, renderer, renderer.scene.film.precision == "half", account)
     except HalfOverflowError as error:
         overflow = error
-        write_exr(exr, channels)
-    write_png(png, tone_map(renderer.film.image(), exposure))
+        write_film(exr, renderer, False, account)
+    write_picture(png, renderer.film, exposure)
     with replacing(account_path) as temporary:
         temporary.write_text(json.dumps(account, indent=2) + "\n", encoding="utf-8")
     if overflow is not None:

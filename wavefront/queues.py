@@ -89,9 +89,10 @@ class Surfaces:
     geometric_normal: wp.array[wp.vec3]  # on the side of the shading normal
     shading_normal: wp.array[wp.vec3]
     offset: wp.array[wp.float32]  # how far along the geometric normal a ray must start, in metres
-    uv: wp.array[wp.vec2]  # allocated if a texture is looked up
+    uv: wp.array[wp.vec2]  # allocated if a texture is looked up, or asked for as an AOV
     material: wp.array[wp.int32]  # -1 where the ray escaped
     light: wp.array[wp.int32]  # -1 where the surface does not emit
+    shape: wp.array[wp.int32]  # allocated if asked for as an AOV
 
 
 @wp.struct

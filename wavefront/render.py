@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import signal
 import sys
 import time
@@ -15,6 +16,7 @@ from rich.table import Table
 
 import wavefront
 from wavefront.errors import WavefrontError
+from wavefront.film import CHANNELS
 from wavefront.output import check_not_read, check_writable, describe_render, write_outputs
 from wavefront.renderer import Renderer
 from wavefront.scene import json_format, load_scene
@@ -55,6 +57,14 @@ def parse_size(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
+def parse_crop(text: str) -> tuple[int, ...]:
+    """Width, height, x and y of a window."""
+    match = re.fullmatch(r"([0-9]+)x([0-9]+)\+([0-9]+)\+([0-9]+)", text.lower())
+    if match is None:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a window; allowed: WIDTHxHEIGHT+X+Y, such as 64x48+100+20")
+    return tuple(map(int, match.groups()))
+
+
 def build_parser() -> argparse.ArgumentParser:
     """The command line."""
     parser = argparse.ArgumentParser(
@@ -70,7 +80,13 @@ def build_parser() -> argparse.ArgumentParser:
     output = parser.add_argument_group("output")
     output.add_argument("-o", "--output", metavar="OUT.exr", help="default: the scene's name, in the current folder")
     output.add_argument("--size", type=parse_size, metavar="WxH", help="film size in pixels")
-    output.add_argument("--aov", metavar="A,B", help="extra channels: albedo, normal, depth, variance (of the mean)")
+    output.add_argument(
+        "--crop",
+        type=parse_crop,
+        metavar="WxH+X+Y",
+        help="render a window of the film, X,Y being its upper left corner",
+    )
+    output.add_argument("--aov", metavar="A,B", help=f"extra channels: {', '.join(CHANNELS)}")
     output.add_argument("--half", action="store_true", help="16-bit floats; a value that overflows is an error")
     output.add_argument("--exposure", type=float, default=0.0, metavar="STOPS", help="of the PNG only; default 0")
 
@@ -93,7 +109,11 @@ def build_parser() -> argparse.ArgumentParser:
     machine.add_argument("--device", default="cpu", help="cpu (default), cuda or cuda:N")
     machine.add_argument("--threads", type=int, metavar="N", help="workers on the CPU device; default: all cores")
     machine.add_argument(
-        "--memory", type=parse_memory, default="4G", metavar="SIZE", help="budget for film and paths; default 4G"
+        "--memory",
+        type=parse_memory,
+        default="4G",
+        metavar="SIZE",
+        help="most memory: of the process (cpu), of film and paths (cuda); default 4G",
     )
     machine.add_argument("--profile", action="store_true", help="print the time of every stage")
     machine.add_argument("--quiet", action="store_true", help="print errors only")
@@ -105,6 +125,10 @@ def overrides_from(arguments: argparse.Namespace) -> list[str]:
     overrides = []
     if arguments.size:
         overrides += [f"film.width={arguments.size[0]}", f"film.height={arguments.size[1]}"]
+    if arguments.crop:
+        overrides.append(
+            "film.crop=" + json.dumps(dict(zip(("width", "height", "x", "y"), arguments.crop, strict=True)))
+        )
     if arguments.aov is not None:
         overrides.append(f"film.aovs={json.dumps([name for name in arguments.aov.split(',') if name])}")
     if arguments.half:
@@ -159,9 +183,14 @@ def run_with_progress(renderer: Renderer, console: Console, spp: int | None, sec
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    film, workers = renderer.scene.film, f" with {renderer.threads} threads" if renderer.device == "cpu" else ""
+    film, workers = renderer.film, f" with {renderer.threads} threads" if renderer.device == "cpu" else ""
     with Interrupt(console) as interrupt, Progress(*columns, console=console) as progress:
-        console.print(f"rendering {film.width}x{film.height} on {renderer.device}{workers}", highlight=False)
+        console.print(
+            f"rendering {film.width}x{film.height} on {renderer.device}{workers}; {renderer.bytes_per_pixel} bytes per "
+            f"pixel, {renderer.bytes_per_path} per path, {renderer.capacity * renderer.threads} paths in flight",
+            highlight=False,
+            soft_wrap=True,
+        )
         task = progress.add_task("", total=seconds or spp, spp="0 spp", rate="")
 
         def update(r: Renderer) -> bool:
@@ -174,7 +203,7 @@ def run_with_progress(renderer: Renderer, console: Console, spp: int | None, sec
             )
             return interrupt.requested
 
-        renderer.render(spp=spp, seconds=seconds, callback=update)
+        renderer.add_samples(spp=spp, seconds=seconds, callback=update)
         return interrupt.requested
 
 
@@ -218,6 +247,7 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
         device=arguments.device,
         threads=arguments.threads,
         memory=arguments.memory,
+        whole_process=True,
         seed=arguments.seed,
         profile=arguments.profile,
         on_compile=lambda message: console.print(message, highlight=False),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 import resource
 import sys
@@ -13,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from wavefront.errors import WavefrontError
-from wavefront.film import Film
+from wavefront.film import BLOCK_PIXELS, CHANNELS, Film
 from wavefront.integrator import (
     Worker,
     make_features,
@@ -26,11 +27,13 @@ from wavefront.queues import TOTAL_PATHS, TOTAL_RAYS, TOTAL_SHADOW_RAYS
 from wavefront.scene.description import Scene
 from wavefront.scene.device import upload_scene
 from wavefront.scene.json_format import checked
+from wavefront.scene.lookup import bsdf_of_shape
 from wavefront.scene.validate import validate
 
 CPU_CAPACITY = 1 << 14  # paths in flight per worker: their state stays in a core's second-level cache
 CUDA_CAPACITY = 1 << 21
 DEFAULT_MEMORY = 4 << 30
+OUTPUT_LIBRARIES = 64 << 20  # code and buffers of what writes images
 PASS_SECONDS = 2.0  # aimed at: passes are where progress, time limits and Ctrl-C are looked at
 
 
@@ -67,6 +70,21 @@ def peak_memory_bytes() -> int:
     return peak if sys.platform == "darwin" else peak * 1024
 
 
+def resident_bytes() -> int:
+    """Memory that this process holds now; where the system does not say, the most that it has held."""
+    try:
+        with open("/proc/self/statm", encoding="ascii") as file:
+            return int(file.read().split()[1]) * resource.getpagesize()
+    except OSError:
+        return peak_memory_bytes()
+
+
+def output_bytes(aovs: tuple[str, ...]) -> int:
+    """Memory that writing a film takes, at most: a block of rows in float64, as channels and interleaved; libraries."""
+    channels = 3 + sum(len(CHANNELS[aov]) for aov in aovs)
+    return BLOCK_PIXELS * (24 + 3 * 4 * channels) + OUTPUT_LIBRARIES
+
+
 class Renderer:
     """Renders one scene; samples add up over calls of `render`.
 
@@ -75,6 +93,8 @@ class Renderer:
         device: ``cpu``, ``cuda`` or ``cuda:N``.
         threads: Workers on the CPU device; default: one per available core.
         memory: Budget in bytes for the film and the path state.
+        whole_process: On the CPU device, the budget is for all that the process holds: what it holds already and what
+            writing the film takes come off it.
         seed: Of the random numbers. Same seed and device, same image.
         profile: On CUDA, time every stage, at the price of a synchronisation after each.
         on_compile: Called with a message before kernels are compiled.
@@ -90,6 +110,7 @@ class Renderer:
         device: str = "cpu",
         threads: int | None = None,
         memory: int = DEFAULT_MEMORY,
+        whole_process: bool = False,
         seed: int = 0,
         profile: bool = False,
         on_compile: Callable[[str], None] | None = None,
@@ -111,11 +132,14 @@ class Renderer:
         film = scene.film
         available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
         self.threads = (threads or available or 1) if self.device == "cpu" else 1
-        aovs = self.features.aovs + (("variance",) if self.features.variance else ())
+        window, aovs = film.window, tuple(film.aovs)
         self.bytes_per_pixel = Film.bytes_per_pixel(aovs)
         self.bytes_per_path = state_bytes_per_slot(self.features)
-        self.capacity = self._plan_capacity(memory, film.width * film.height)
-        self.film = Film(film.width, film.height, aovs, self.device)
+        held = 0
+        if whole_process and self.device == "cpu":
+            held = resident_bytes() + output_bytes(aovs)
+        self.capacity = self._plan_capacity(memory, held, window.width * window.height)
+        self.film = Film(window.width, window.height, aovs, self.device, bsdf_of_shape(scene))
         self.workers = [
             Worker(
                 scene=scene,
@@ -145,19 +169,23 @@ class Renderer:
         wp.force_load(self.device, modules=modules, max_workers=os.cpu_count() or 1)
         self.statistics.compile_seconds = time.perf_counter() - start
 
-    def _plan_capacity(self, memory: int, pixels: int) -> int:
-        """Paths in flight per worker, from the memory budget."""
+    def _plan_capacity(self, memory: int, held: int, pixels: int) -> int:
+        """Paths in flight per worker, from the memory budget, of which some is held already."""
         if pixels > 2**31 - 1:
             raise WavefrontError(f"a film of {pixels} pixels; allowed: up to 2^31 - 1")
-        left = memory - pixels * self.bytes_per_pixel
+        film = pixels * self.bytes_per_pixel
+        left = memory - held - film
         capacity = min(
             CPU_CAPACITY if self.device == "cpu" else CUDA_CAPACITY, left // (self.bytes_per_path * self.threads)
         )
         if capacity < 1024:
-            needed = pixels * self.bytes_per_pixel + 1024 * self.bytes_per_path * self.threads
+            needed = held + film + 1024 * self.bytes_per_path * self.threads
+            rest = (
+                f", {film / 2**20:.0f} MiB of it for the film and {held / 2**20:.0f} MiB for all else" if held else ""
+            )
             raise WavefrontError(
                 f"a memory budget of {memory / 2**20:.0f} MiB is too small for {pixels} pixels on {self.threads} "
-                f"threads; at least {needed / 2**20:.0f} MiB is needed"
+                f"threads; at least {math.ceil(needed / 2**20)} MiB is needed{rest}"
             )
         return int(capacity)
 
@@ -166,21 +194,18 @@ class Renderer:
         """Samples per pixel in the film."""
         return self.film.sample_count
 
-    def render(
+    def add_samples(
         self,
         spp: int | None = None,
         seconds: float | None = None,
         callback: Callable[[Renderer], bool | None] | None = None,
-    ) -> np.ndarray:
-        """Adds samples to the film and returns the image so far.
+    ) -> None:
+        """Adds samples to the film.
 
         Args:
             spp: Samples per pixel to add; default: the scene's, or without limit if `seconds` is given.
             seconds: Wall time after which no further pass starts.
             callback: Called after every pass; returning True ends the render there.
-
-        Returns:
-            Mean radiance, shape [height, width, 3], float32, linear Rec. 709.
 
         Raises:
             WavefrontError: `spp` or `seconds` is not positive.
@@ -211,6 +236,19 @@ class Renderer:
             duration = max(now - pass_start, 1e-6)
             left = PASS_SECONDS if seconds is None else min(PASS_SECONDS, seconds - (now - begin))
             samples = max(1, min(2 * samples, int(samples * left / duration)))
+
+    def render(
+        self,
+        spp: int | None = None,
+        seconds: float | None = None,
+        callback: Callable[[Renderer], bool | None] | None = None,
+    ) -> np.ndarray:
+        """Adds samples to the film, as `add_samples` does, and returns the image so far.
+
+        Returns:
+            Mean radiance, shape [height, width, 3], float32, linear Rec. 709.
+        """
+        self.add_samples(spp, seconds, callback)
         return self.film.image()
 
     def _pass(self, samples: int) -> None:

@@ -73,7 +73,7 @@ def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
         triangles: The scene has triangles.
         spheres: The scene has spheres.
         smooth: Some mesh has vertex normals.
-        uvs: Some texture is looked up.
+        uvs: Something reads UVs.
     """
 
     @wp.func

@@ -85,14 +85,17 @@ def test_text_that_is_not_json_is_refused_with_its_place(error, raw, message):
     [
         (
             {"film": {"widht": 3}},
-            "film: unknown key 'widht'; did you mean 'width'? valid keys: width, height, filter, aovs, precision",
+            "film: unknown key 'widht'; did you mean 'width'? valid keys: width, height, crop, pixel_aspect, filter, aovs, precision",
         ),
         (
             {"fiml": {}},
             "unknown key 'fiml'; did you mean 'film'? "
             "valid keys: shapes, camera, film, integrator, textures, bsdfs, emitters, include, description",
         ),
-        ({"film": {"a\nb": 1}}, "film: unknown key 'a\\nb'; valid keys: width, height, filter, aovs, precision"),
+        (
+            {"film": {"a\nb": 1}},
+            "film: unknown key 'a\\nb'; valid keys: width, height, crop, pixel_aspect, filter, aovs, precision",
+        ),
         (
             {"shapes": [SPHERE, {"type": "spere"}]},
             "shapes[1].type: unknown type 'spere'; did you mean 'sphere'? "
@@ -129,7 +132,8 @@ def test_text_that_is_not_json_is_refused_with_its_place(error, raw, message):
         ({"integrator": {"nee": 1}}, "integrator.nee: expected true or false; found 1"),
         (
             {"film": {"aovs": ["albdo"]}},
-            "film.aovs[0]: expected 'albedo', 'depth', 'normal' or 'variance'; found the string 'albdo'",
+            "film.aovs[0]: expected 'albedo', 'bsdf_index', 'depth', 'geometric_normal', 'normal', 'position', "
+            "'sample_count', 'shape_index', 'uv' or 'variance'; found the string 'albdo'",
         ),
         ({"shapes": {}}, "shapes: expected a list of objects; found an object"),
         (sphere(to_world=[[1, 2]]), "shapes[0].to_world[0]: expected an object or a list of 4 numbers; found [1, 2]"),

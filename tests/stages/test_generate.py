@@ -8,6 +8,7 @@ from scipy import special
 from tests.stages.harness import Counters, array, launch, paths, uniforms, unit
 from wavefront import queues
 from wavefront.camera import make_camera
+from wavefront.film import make_window
 from wavefront.rng import PURPOSE_CAMERA
 from wavefront.scene import description as d
 from wavefront.stages.generate import make_generate
@@ -22,15 +23,17 @@ ORIGIN, TARGET = np.array([1.0, 2.0, 3.0]), np.array([0.0, 1.5, -1.0])
 def generate(kind, scale, fov_axis="x", transmission=False, tile=TILE):
     look_at = d.LookAt(origin=tuple(ORIGIN), target=tuple(TARGET))
     camera = d.Perspective(fov=50.0, fov_axis=fov_axis, to_world=[d.TransformStep(look_at=look_at)])
-    record = make_camera(camera, d.Film(width=WIDTH, height=HEIGHT))
+    film = d.Film(width=WIDTH, height=HEIGHT)
+    record = make_camera(camera, film)
     counters = Counters(depth=9)
     capacity = COUNT + 10
     stale = dict.fromkeys(("origin", "direction", "beta", "L", "pdf"), np.nan)
     p = paths(capacity, **stale, eta=-1.0, pixel=77777, sample=7)
     rays = counters.queue("rays", capacity=capacity)
     counters.array.numpy()[:] = 5
-    arguments = [record, array(np.array(tile, np.int32), wp.int32), WIDTH, scale, wp.uint64(SEED)]
-    launch(make_generate(kind, transmission), capacity, *arguments, p, rays, counters.array, counters.totals)
+    arguments = [record, array(np.array(tile, np.int32), wp.int32), make_window(film), scale, wp.uint64(SEED)]
+    kernel = make_generate("perspective", kind, transmission)
+    launch(kernel, capacity, *arguments, p, rays, counters.array, counters.totals)
     return p, rays, counters
 
 

@@ -57,20 +57,38 @@ class _Writer:
 
     def _camera(self):
         camera, film = self.scene.camera, self.scene.film
+        if film.pixel_aspect != 1.0:
+            raise WavefrontError("film.pixel_aspect: Mitsuba has square pixels")
         kind = type(film.filter).__struct_config__.tag
         rfilter = {"type": kind}
         rfilter |= {name: getattr(film.filter, name) for name in film.filter.__struct_fields__}
-        return {
-            "type": "perspective",
-            "fov": camera.fov,
-            "fov_axis": camera.fov_axis,
+        window = film.window
+        frame = CAMERA_FRAME
+        if isinstance(camera, description.Orthographic):
+            result = {"type": "orthographic"}
+            frame = CAMERA_FRAME @ np.diag([camera.width / 2.0, camera.width / 2.0, 1.0, 1.0])
+        else:
+            result = {"type": "perspective", "fov": camera.fov, "fov_axis": camera.fov_axis}
+            x, y = camera.principal_point_offset
+            if isinstance(camera, description.ThinLens):
+                if x or y:
+                    raise WavefrontError("camera.principal_point_offset: Mitsuba's thin lens has none")
+                lens = {"aperture_radius": camera.aperture_radius, "focus_distance": camera.focus_distance}
+                result |= {"type": "thinlens", **lens}
+            else:
+                result |= {"principal_point_offset_x": x, "principal_point_offset_y": y}
+        return result | {
             "near_clip": 1e-3,  # ours clips nothing
             "far_clip": 1e5,
-            "to_world": self._transform(to_matrix(camera.to_world, "camera.to_world") @ CAMERA_FRAME),
+            "to_world": self._transform(to_matrix(camera.to_world, "camera.to_world") @ frame),
             "film": {
                 "type": "hdrfilm",
                 "width": film.width,
                 "height": film.height,
+                "crop_offset_x": window.x,
+                "crop_offset_y": window.y,
+                "crop_width": window.width,
+                "crop_height": window.height,
                 "pixel_format": "rgb",
                 "component_format": "float32",
                 "rfilter": rfilter,

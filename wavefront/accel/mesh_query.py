@@ -23,6 +23,7 @@ class Shape:
     smooth: wp.int32  # 1: has vertex normals
     flip: wp.int32  # 1: a sphere that faces inwards
     two_sided: wp.int32  # 1: the back emits too
+    index: wp.int32  # place in the scene's list of shapes
 
 
 @wp.struct
@@ -33,9 +34,9 @@ class Geometry:
     points: wp.array[wp.vec3]
     indices: wp.array[wp.int32]
     normals: wp.array[wp.vec3]  # per vertex; empty if no mesh has any
-    uvs: wp.array[wp.vec2]  # per vertex; empty if no texture is looked up
+    uvs: wp.array[wp.vec2]  # per vertex; empty if nothing reads UVs
     spheres: wp.array[wp.vec4]  # centre and radius
-    sphere_to_local: wp.array[wp.mat33]  # world normals to the sphere's own axes; empty if no texture is looked up
+    sphere_to_local: wp.array[wp.mat33]  # world normals to the sphere's own axes; empty if nothing reads UVs
     shape_of: wp.array[wp.int32]  # shape of each primitive
     shapes: wp.array[Shape]
 

@@ -391,7 +391,31 @@ class Perspective(Record, tag_field="type", tag="perspective"):
 
     fov: Annotated[float, Meta(gt=0.0, lt=180.0, description="Field of view along fov_axis, degrees.")] = 40.0
     fov_axis: Literal["x", "y", "diagonal", "smaller", "larger"] = "x"
+    principal_point_offset: Annotated[
+        Vec2, Meta(description="Moves the image to the left and up, in fractions of the film's width and height.")
+    ] = (0.0, 0.0)
     to_world: Transform = []
+
+
+class ThinLens(Perspective, kw_only=True, tag_field="type", tag="thin_lens"):
+    """Camera with a thin lens: what is nearer or farther than the focus distance is blurred."""
+
+    aperture_radius: Annotated[
+        NonNegative, Meta(description="Radius of the lens in metres, before to_world; 0 is a pinhole.")
+    ]
+    focus_distance: Annotated[
+        Positive, Meta(description="Of the plane that is sharp, along local -Z, in metres, before to_world.")
+    ]
+
+
+class Orthographic(Record, tag_field="type", tag="orthographic"):
+    """Camera of parallel rays, which start on its film at local z = 0."""
+
+    width: Annotated[Positive, Meta(description="Width of the film in metres, before to_world.")] = 2.0
+    to_world: Transform = []
+
+
+Camera = Perspective | ThinLens | Orthographic
 
 
 class BoxFilter(Record, tag_field="type", tag="box"):
@@ -409,20 +433,54 @@ class GaussianFilter(Record, tag_field="type", tag="gaussian"):
 
 
 Filter = BoxFilter | TentFilter | GaussianFilter
-Aov = Literal["albedo", "normal", "depth", "variance"]
+Aov = Literal[
+    "albedo",
+    "normal",
+    "geometric_normal",
+    "depth",
+    "position",
+    "uv",
+    "shape_index",
+    "bsdf_index",
+    "sample_count",
+    "variance",
+]
+
+
+class Crop(Record):
+    """A window of the film, in pixels from its upper left corner."""
+
+    width: Annotated[int, Meta(ge=1, le=65536)]
+    height: Annotated[int, Meta(ge=1, le=65536)]
+    x: Annotated[int, Meta(ge=0, le=65535)] = 0
+    y: Annotated[int, Meta(ge=0, le=65535)] = 0
 
 
 class Film(Record):
     width: Annotated[int, Meta(ge=1, le=65536)] = 512
     height: Annotated[int, Meta(ge=1, le=65536)] = 512
+    crop: Annotated[
+        Crop | None, Meta(description="Render these pixels alone; they are those of the whole film to the last bit.")
+    ] = None
+    pixel_aspect: Annotated[
+        float, Meta(ge=0.01, le=100.0, description="Width of a pixel over its height, where the image is shown.")
+    ] = 1.0
     filter: Filter = msgspec.field(default_factory=BoxFilter)
     aovs: Annotated[
         list[Aov],
-        Meta(description="Extra channels: first-hit albedo, shading normal, depth; variance of the mean luminance."),
+        Meta(
+            description="Extra channels: of the first hit albedo, shading and geometric normal, depth, position, UV, "
+            "index of the shape and of the BSDF; number of samples; variance of the mean luminance."
+        ),
     ] = []
     precision: Annotated[Literal["float", "half"], Meta(description="Of the EXR file; half overflows at 65504.")] = (
         "float"
     )
+
+    @property
+    def window(self) -> Crop:
+        """The pixels that are rendered."""
+        return self.crop or Crop(width=self.width, height=self.height)
 
 
 class PathIntegrator(Record, tag_field="type", tag="path"):
@@ -450,7 +508,7 @@ class Scene(Record):
     """A whole scene. File paths in memory are absolute; in a file they are relative to it."""
 
     shapes: Annotated[list[AnyShape], Meta(description="What is in the scene.")] = []
-    camera: Perspective = msgspec.field(default_factory=Perspective)
+    camera: Camera = msgspec.field(default_factory=Perspective)
     film: Film = msgspec.field(default_factory=Film)
     integrator: PathIntegrator = msgspec.field(default_factory=PathIntegrator)
     textures: Annotated[list[Texture], Meta(description="Named textures.")] = []

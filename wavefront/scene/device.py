@@ -96,6 +96,7 @@ class _Upload:
             where = f"shapes[{i}]"
             emitter = self._emitter(shape.emitter, where) if shape.emitter is not None else -1
             record = {"material": self.materials.add(shape.bsdf, f"{where}.bsdf"), "first_light": -1}
+            record["index"] = i
             record["two_sided"] = int(shape.emitter is not None and shape.emitter.two_sided)
             if isinstance(shape, description.Sphere):
                 matrix = to_matrix(shape.to_world, f"{where}.to_world")
@@ -130,7 +131,7 @@ class _Upload:
         if any(mesh.normals is not None for _, mesh, _ in meshes):
             normals = [m.normals if m.normals is not None else np.zeros_like(m.vertices) for _, m, _ in meshes]
             geometry.normals = wp.array(np.concatenate(normals), dtype=wp.vec3, device=device)
-        if self.atlas.records:
+        if self.atlas.records or "uv" in self.scene.film.aovs:
             if meshes:
                 uvs = [m.uvs if m.uvs is not None else np.zeros((len(m.vertices), 2)) for _, m, _ in meshes]
                 geometry.uvs = wp.array(np.concatenate(uvs), dtype=wp.vec2, device=device)

@@ -1,11 +1,14 @@
-"""Image files to arrays and back: Pillow for 8-bit images, OpenEXR for floating point, OpenImageIO for Radiance HDR."""
+"""Image files to arrays and back.
+
+Pillow reads 8-bit images, OpenEXR floating point, OpenImageIO Radiance HDR; OpenImageIO writes, for it takes rows.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import secrets
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -121,13 +124,19 @@ def _load_hdr(path, where):
 # --- writing ---------------------------------------------------------------------------------------------------
 
 
-def write_exr(path: str | os.PathLike, channels: dict[str, np.ndarray], half: bool = False) -> None:
+def write_exr(
+    path: str | os.PathLike,
+    channels: dict[str, np.ndarray],
+    half: bool = False,
+    attributes: dict[str, int | float | str] | None = None,
+) -> None:
     """Writes an OpenEXR image (scan lines, ZIP); the file appears whole or not at all.
 
     Args:
         path: The file.
         channels: (H, W) arrays by channel name: ``R``, ``G``, ``B``, ``albedo.R``, ...
         half: 16-bit floats; else 32-bit.
+        attributes: Of the header, by name.
 
     Raises:
         HalfOverflowError: A finite value beyond 65504 in half precision.
@@ -136,24 +145,61 @@ def write_exr(path: str | os.PathLike, channels: dict[str, np.ndarray], half: bo
     shapes = {np.shape(pixels) for pixels in channels.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 2 or 0 in next(iter(shapes)):
         raise WavefrontError(f"{path}: channels must be (H, W) arrays of one shape; found {sorted(shapes)}")
-    data = {}
-    for name, pixels in channels.items():
-        pixels = np.ascontiguousarray(pixels, np.float32)
-        if half:
-            finite = np.abs(pixels[np.isfinite(pixels)])
-            if finite.size and finite.max() > HALF_MAX:
-                raise HalfOverflowError(
-                    f"{path}: channel {name} has {finite.max():.6g}, but half precision ends at 65504"
-                )
-            pixels = pixels.astype(np.float16)
-        data[name] = pixels
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with replacing(path) as temporary:
-        try:
-            with OpenEXR.File(header, data) as file:
-                file.write(str(temporary))
-        except RuntimeError as error:
-            raise OSError(str(error)) from None
+    height, width = shapes.pop()
+    formats = dict.fromkeys(channels, "half" if half else "float")
+    write_exr_blocks(path, (0, 0, width, height), (width, height), formats, [channels], attributes)
+
+
+def write_exr_blocks(
+    path: str | os.PathLike,
+    window: tuple[int, int, int, int],
+    size: tuple[int, int],
+    formats: dict[str, str],
+    blocks: Iterable[dict[str, np.ndarray]],
+    attributes: dict[str, int | float | str] | None = None,
+) -> None:
+    """Writes an OpenEXR image (scan lines, ZIP) block by block; the file appears whole or not at all.
+
+    Args:
+        path: The file.
+        window: x, y, width and height of the data in the image (the data window).
+        size: Width and height of the image (the display window).
+        formats: ``half`` or ``float`` for every channel.
+        blocks: Arrays (rows, width) of every channel, from the top.
+        attributes: Of the header, by name; ``PixelAspectRatio`` and ``Software`` are known to the format.
+
+    Raises:
+        HalfOverflowError: A finite value beyond 65504 in half precision.
+        WavefrontError: The file cannot be written.
+    """
+    import OpenImageIO  # only here: it takes 30 MB
+
+    x, y, width, height = window
+    kinds = tuple(formats.values())
+    spec = OpenImageIO.ImageSpec(width, height, len(formats), "half" if set(kinds) == {"half"} else "float")
+    spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height = x, y, 0, 0, *size
+    spec.channelnames = tuple(formats)
+    if len(set(kinds)) > 1:  # where all are alike, it is not read
+        spec.channelformats = kinds
+    spec.attribute("compression", "zip")
+    spec.attribute("DateTime", "")  # none: a file says what is in it alone
+    for name, value in (attributes or {}).items():
+        spec.attribute(name, value)
+
+    def interleaved():
+        for block in blocks:
+            for name, kind in formats.items():
+                if kind == "half":
+                    _check_half(path, name, block[name])
+            yield np.stack([block[name] for name in formats], axis=-1, dtype=np.float32, casting="same_kind")
+
+    _write_scanlines(path, spec, interleaved())
+
+
+def _check_half(path, name, pixels):
+    finite = np.abs(pixels[np.isfinite(pixels)])
+    if finite.size and finite.max() > HALF_MAX:
+        raise HalfOverflowError(f"{path}: channel {name} has {finite.max():.6g}, but half precision ends at 65504")
 
 
 def write_png(path: str | os.PathLike, rgb8: np.ndarray) -> None:
@@ -169,5 +215,44 @@ def write_png(path: str | os.PathLike, rgb8: np.ndarray) -> None:
     rgb8 = np.asarray(rgb8)
     if rgb8.dtype != np.uint8 or not (rgb8.ndim == 2 or (rgb8.ndim == 3 and rgb8.shape[2] == 3)) or not rgb8.size:
         raise WavefrontError(f"{path}: a PNG needs (H, W, 3) or (H, W) uint8; found {rgb8.shape} {rgb8.dtype}")
+    write_png_blocks(path, rgb8.shape, [rgb8])
+
+
+def write_png_blocks(path: str | os.PathLike, shape: tuple[int, ...], blocks: Iterable[np.ndarray]) -> None:
+    """Writes an 8-bit PNG block by block; the file appears whole or not at all.
+
+    Args:
+        path: The file.
+        shape: (H, W, 3) or (H, W) of the image.
+        blocks: Rows of it from the top, uint8.
+
+    Raises:
+        WavefrontError: The file cannot be written.
+    """
+    import OpenImageIO
+
+    height, width, channels = (*shape, 1)[:3]
+    spec = OpenImageIO.ImageSpec(width, height, channels, "uint8")
+    _write_scanlines(path, spec, (block.reshape(-1, width, channels) for block in blocks))
+
+
+def _write_scanlines(path, spec, blocks):
+    """Writes blocks of rows [rows, width, channels] to a new file."""
+    import OpenImageIO
+
+    def check(done, image):
+        # Some writers report an error, but no failure.
+        if not done or image.has_error:
+            raise OSError((image.geterror() or "unknown error").splitlines()[0])
+
     with replacing(path) as temporary:
-        Image.fromarray(rgb8).save(temporary, format="PNG")
+        image = OpenImageIO.ImageOutput.create(str(temporary))
+        check(image.open(str(temporary), spec), image)
+        try:
+            y = spec.y
+            for block in blocks:
+                check(image.write_scanlines(y, y + len(block), 0, np.ascontiguousarray(block)), image)
+                y += len(block)
+        finally:
+            closed = image.close()
+        check(closed, image)

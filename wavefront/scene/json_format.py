@@ -23,6 +23,7 @@ INCLUDABLE = ("textures", "bsdfs", "emitters", "shapes")
 _INCLUDE_KEYS = (*INCLUDABLE, "description", "include")
 _OVERRIDE_STEP = re.compile(r"([A-Za-z_]\w*)((?:\[\d{1,9}\])*)")
 _LINE_LENGTH = 120
+_DEFAULT_CAMERA = description.Perspective.__struct_config__.tag  # of a camera that leaves its type out
 
 # A string, which is stepped over, or a number that Python's parser would take or refuse but that is not in JSON.
 _BAD_NUMBER = re.compile(r'"(?:\\.|[^"\\])*"|(NaN|-?Infinity|\d{1000,})')
@@ -168,6 +169,8 @@ def _printable_path(steps):
 def _convert(raw, path, overrides=()):
     """Records from a raw object that `overrides` change first."""
     applied = [_apply_override(raw, override, path) for override in overrides]
+    if isinstance(raw.get("camera"), dict):
+        raw["camera"].setdefault("type", _DEFAULT_CAMERA)
     try:
         return msgspec.convert(raw, description.Scene)
     except RecursionError:
@@ -394,6 +397,7 @@ def schema() -> dict:
     generated = msgspec.json.schema(description.Scene)
     told_apart = set()
     _find_unions(generated, told_apart)
+    told_apart.discard("#/$defs/Perspective")  # of cameras, the one that needs no type
     for definition in generated["$defs"].values():
         # A record that stands where no other can may leave its type out.
         if f"#/$defs/{definition['title']}" not in told_apart:

@@ -61,6 +61,13 @@ def resolve_bsdf(scene: description.Scene, ref: str | description.Bsdf | None) -
     return _resolve("bsdf", scene.bsdfs, ref)
 
 
+def bsdf_of_shape(scene: description.Scene) -> list[int]:
+    """Index of the BSDF of each shape: its place in `bsdfs`; those that stand in shapes are counted on from there."""
+    places = {bsdf.name: i for i, bsdf in enumerate(scene.bsdfs)}
+    own = iter(range(len(scene.bsdfs), len(scene.bsdfs) + len(scene.shapes)))
+    return [places[shape.bsdf] if isinstance(shape.bsdf, str) else next(own) for shape in scene.shapes]
+
+
 def resolve_texture(scene: description.Scene, ref: object) -> object:
     """The texture record that `ref` names; a number, a colour or a texture record is returned as it is.
 

@@ -27,6 +27,7 @@ from wavefront.scene.mitsuba_xml import Document, Plugin, read, rows, world_matr
 UNLIMITED_DEPTH = 1000
 # Mitsuba's camera looks along +Z with +X to the left; ours along -Z with +X to the right.
 CAMERA_FRAME = np.diag([-1.0, 1.0, -1.0, 1.0])
+_FAR_CLIP = 1e4  # what Mitsuba's thin lens focuses on by default
 _DIAGONAL_35MM = 43.266615300557  # millimetres: the film that a focal length refers to
 
 _INTEGRATORS_OF_ANOTHER_IMAGE = ("ao", "aov", "depth", "field", "irrcache", "moment", "multichannel", "stokes", "vaov")
@@ -106,8 +107,37 @@ class _Importer:
         if len(sensors) > 1:
             self.warn(f"{sensors[1].where()}: the scene has {len(sensors)} sensors; the first is used")
         plugin = sensors[0]
-        if plugin.type != "perspective":
-            raise plugin.error(f"{plugin.label()} is not supported; supported: perspective")
+        kinds = {"perspective": self._perspective, "thinlens": self._thin_lens, "orthographic": self._orthographic}
+        if plugin.type not in kinds:
+            raise plugin.error(f"{plugin.label()} is not supported; supported: {', '.join(kinds)}")
+        camera = kinds[plugin.type](plugin)
+        for name in ("near_clip", "far_clip"):
+            if plugin.get(name) is not None:
+                self.warn(f"{plugin.get(name).where()}: {name} is left out; nothing is clipped")
+        plugin.ignore("focus_distance", "shutter_open", "shutter_close", "near_clip", "far_clip")
+        spp = self._sampler(plugin)
+        film = self._film(plugin)
+        plugin.finish("film", "sampler")
+        return camera, film, spp
+
+    def _perspective(self, plugin):
+        offset = tuple(plugin.number(f"principal_point_offset_{axis}", 0.0) for axis in "xy")
+        return description.Perspective(principal_point_offset=offset, **self._view(plugin))
+
+    def _thin_lens(self, plugin):
+        radius = plugin.number("aperture_radius")
+        if radius is None:
+            raise plugin.error(f"{plugin.label()} needs an aperture_radius")
+        if radius < 0.0:
+            raise plugin.get("aperture_radius").error(f"aperture_radius must be at least 0; found {radius:g}")
+        focus = self._positive(plugin, "focus_distance", plugin.number("far_clip", _FAR_CLIP))
+        return description.ThinLens(aperture_radius=radius, focus_distance=focus, **self._view(plugin))
+
+    def _orthographic(self, plugin):
+        return description.Orthographic(to_world=rows(world_matrix(plugin) @ CAMERA_FRAME))
+
+    def _view(self, plugin):
+        """The fields of a perspective camera: field of view and place."""
         axis = plugin.string("fov_axis", "x", ("x", "y", "diagonal", "smaller", "larger"))
         fov = plugin.number("fov")
         if fov is None:
@@ -116,19 +146,7 @@ class _Importer:
             raise plugin.error("a sensor has either fov or focal_length")
         if not 0.0 < fov < 180.0:
             raise plugin.error(f"fov must be between 0 and 180 degrees; found {fov:g}")
-        for name in ("principal_point_offset_x", "principal_point_offset_y"):
-            if plugin.number(name, 0.0) != 0.0:
-                raise plugin.get(name).error(f"{name} is not supported")
-        for name in ("near_clip", "far_clip"):
-            if plugin.get(name) is not None:
-                self.warn(f"{plugin.get(name).where()}: {name} is left out; nothing is clipped")
-        plugin.ignore("focus_distance", "shutter_open", "shutter_close", "near_clip", "far_clip")
-        matrix = world_matrix(plugin)
-        camera = description.Perspective(fov=fov, fov_axis=axis, to_world=rows(matrix @ CAMERA_FRAME))
-        spp = self._sampler(plugin)
-        film = self._film(plugin)
-        plugin.finish("film", "sampler")
-        return camera, film, spp
+        return {"fov": fov, "fov_axis": axis, "to_world": rows(world_matrix(plugin) @ CAMERA_FRAME)}
 
     def _focal_fov(self, plugin):
         text = plugin.string("focal_length", "50mm").strip()
@@ -167,11 +185,7 @@ class _Importer:
         for name, value in (("width", width), ("height", height)):
             if not 1 <= value <= 65536:
                 raise film.get(name).error(f"{name} must be from 1 to 65536; found {value}")
-        for name, whole in (
-            ("crop_offset_x", 0), ("crop_offset_y", 0), ("crop_width", width), ("crop_height", height),
-        ):  # fmt: skip
-            if film.integer(name, whole) != whole:
-                raise film.get(name).error("a crop window is not supported")
+        crop = self._crop(film, width, height)
         # how the file is written, not what is in the image
         film.ignore(
             "file_format", "pixel_format", "component_format", "banner", "gamma", "exposure", "tonemap_method", "key",
@@ -180,7 +194,18 @@ class _Importer:
         filters = film.objects("rfilter")
         record = self._filter(filters[0]) if filters else description.GaussianFilter()
         film.finish("rfilter")
-        return description.Film(width=width, height=height, filter=record)
+        return description.Film(width=width, height=height, crop=crop, filter=record)
+
+    def _crop(self, film, width, height):
+        keys = {"x": "crop_offset_x", "y": "crop_offset_y", "width": "crop_width", "height": "crop_height"}
+        whole = {"x": 0, "y": 0, "width": width, "height": height}
+        window = {key: film.integer(name, whole[key]) for key, name in keys.items()}
+        for corner, side in (("x", "width"), ("y", "height")):
+            if window[corner] < 0 or window[side] < 1 or window[corner] + window[side] > whole[side]:
+                given = keys[corner] if film.has(keys[corner]) and not film.has(keys[side]) else keys[side]
+                found = f"{window[side]} from {window[corner]} on"
+                raise film.get(given).error(f"the crop window must lie in the {side} of {whole[side]}; found {found}")
+        return None if window == whole else description.Crop(**window)
 
     def _filter(self, plugin):
         if plugin.type == "box":

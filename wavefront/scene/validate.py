@@ -52,6 +52,7 @@ def validate(
                     f"shapes[{i}].to_world", "a sphere can be scaled uniformly only; found different scales or a shear"
                 )
         _check_transform(scene.camera.to_world, "camera.to_world")
+        _check_crop(scene.film)
         _check_emitters(scene)
         for i, aov in enumerate(scene.film.aovs):
             if aov in scene.film.aovs[:i]:
@@ -183,6 +184,16 @@ def _check_emitters(scene):
                 _fail(f"{path}.beam_width", f"expected at most cutoff_angle; found {found}")
         if isinstance(emitter, description.Sun) and emitter.irradiance is not None and emitter.radiance is not None:
             _fail(path, "a sun has irradiance or radiance; found both")
+
+
+# --- film ------------------------------------------------------------------------------------------------------
+
+
+def _check_crop(film):
+    window = film.window
+    if window.x + window.width > film.width or window.y + window.height > film.height:
+        found = f"{window.width}x{window.height} at ({window.x}, {window.y})"
+        _fail("film.crop", f"expected a window inside the film of {film.width}x{film.height} pixels; found {found}")
 
 
 # --- shapes ----------------------------------------------------------------------------------------------------

@@ -6,7 +6,8 @@ import functools
 
 import warp as wp
 
-from wavefront.camera import Camera, camera_ray
+from wavefront.camera import Camera, make_camera_ray
+from wavefront.film import FilmWindow
 from wavefront.queues import (
     CONTINUE,
     DEPTH,
@@ -30,20 +31,22 @@ from wavefront.warp_samples import square_to_gaussian, square_to_tent
 
 
 @functools.cache
-def make_generate(filter_kind: str, transmission: bool):
+def make_generate(camera_kind: str, filter_kind: str, transmission: bool):
     """Kernel of the stage.
 
     Args:
+        camera_kind: See `wavefront.camera.make_camera_ray`.
         filter_kind: Reconstruction filter, ``box``, ``tent`` or ``gaussian``, sampled so that each sample counts for
             its own pixel alone (Ernst, Stamminger and Greiner 2006, "Filter Importance Sampling").
         transmission: Whether paths track the index of refraction.
     """
+    camera_ray = make_camera_ray(camera_kind)
 
     @wp.kernel(enable_backward=False, module="unique")
     def generate_rays(
         camera: Camera,
         tile: wp.array[wp.int32],
-        film_width: int,
+        window: FilmWindow,
         filter_scale: float,
         seed: wp.uint64,
         # out
@@ -67,9 +70,10 @@ def make_generate(filter_kind: str, transmission: bool):
             counters[CONTINUE] = 1
             totals[TOTAL_PATHS] += wp.int64(count)
         local = slot // samples
-        x = tile[TILE_X] + local % tile[TILE_WIDTH]
-        y = tile[TILE_Y] + local // tile[TILE_WIDTH]
-        pixel = wp.uint32(y) * wp.uint32(film_width) + wp.uint32(x)
+        # Pixels are numbered over the whole film, so that those of a window draw the same random numbers.
+        x = window.x + tile[TILE_X] + local % tile[TILE_WIDTH]
+        y = window.y + tile[TILE_Y] + local // tile[TILE_WIDTH]
+        pixel = wp.uint32(y) * wp.uint32(window.film_width) + wp.uint32(x)
         sample = wp.uint32(tile[FIRST_SAMPLE] + slot % samples)
         u = uniform4(seed, pixel, sample, 0, PURPOSE_CAMERA)
         square = wp.vec2(u[0], u[1])
@@ -78,8 +82,9 @@ def make_generate(filter_kind: str, transmission: bool):
             offset = filter_scale * square_to_tent(square)
         if wp.static(filter_kind == "gaussian"):
             offset = filter_scale * square_to_gaussian(square)
-        paths.origin[slot] = camera.origin
-        paths.direction[slot] = camera_ray(camera, float(x) + 0.5 + offset[0], float(y) + 0.5 + offset[1])
+        ray = camera_ray(camera, float(x) + 0.5 + offset[0], float(y) + 0.5 + offset[1], wp.vec2(u[2], u[3]))
+        paths.origin[slot] = ray.origin
+        paths.direction[slot] = ray.direction
         paths.beta[slot] = wp.vec3(1.0)
         paths.L[slot] = wp.vec3(0.0)
         paths.pdf[slot] = 0.0

@@ -12,8 +12,19 @@ from wavefront.surface import make_vertex
 
 
 @functools.cache
-def make_intersect(triangles: bool, spheres: bool, smooth: bool, uvs: bool, area_lights: bool, escape_lights: bool):
-    """Kernel of the stage; the arguments are the fields of `Features` of the same name (or whether there are any)."""
+def make_intersect(
+    triangles: bool,
+    spheres: bool,
+    smooth: bool,
+    uvs: bool,
+    area_lights: bool,
+    escape_lights: bool,
+    shape_index: bool = False,
+):
+    """Kernel of the stage; the arguments are the fields of `Features` of the same name (or whether there are any).
+
+    `shape_index`: whether the index of the shape is an AOV.
+    """
     closest_hit, _ = make_intersector(triangles, spheres)
     vertex_of = make_vertex(triangles, spheres, smooth, uvs)
 
@@ -51,6 +62,8 @@ def make_intersect(triangles: bool, spheres: bool, smooth: bool, uvs: bool, area
         surfaces.material[slot] = shape.material
         if wp.static(uvs):
             surfaces.uv[slot] = vertex.uv
+        if wp.static(shape_index):
+            surfaces.shape[slot] = shape.index
         if wp.static(area_lights):
             light = int(-1)
             front = wp.dot(vertex.geometric_normal, direction) < 0.0
