@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 import os
 import platform
@@ -16,6 +15,7 @@ import warp as wp
 
 import wavefront
 from wavefront.errors import WavefrontError
+from wavefront.identity import scene_hash
 from wavefront.renderer import Renderer, peak_memory_bytes
 from wavefront.scene import description
 from wavefront.scene.images import HalfOverflowError, replacing, write_exr, write_png
@@ -78,21 +78,20 @@ def tone_map(image: np.ndarray, exposure: float = 0.0) -> np.ndarray:
     return (encoded * 255.0 + 0.5).astype(np.uint8)
 
 
-def scene_hash(scene: description.Scene) -> str:
-    """SHA-256 of a scene: its records, with the contents of files in the place of their paths."""
-    plain = msgspec.to_builtins(scene)
-    files = {}
-    for _, record in walk(scene):
-        file = getattr(record, "file", None)
-        if file and file not in files:
-            files[file] = hashlib.sha256(Path(file).read_bytes()).hexdigest()
+def image_attributes(renderer: Renderer) -> dict[str, int | str]:
+    """What the header of an image says of its making, for those who combine images (see `tools.merge`).
 
-    def replace(value):
-        if isinstance(value, dict):
-            return {k: files.get(v, v) if k == "file" else replace(v) for k, v in value.items()}
-        return [replace(v) for v in value] if isinstance(value, list) else value
-
-    return hashlib.sha256(json.dumps(replace(plain), sort_keys=True).encode()).hexdigest()
+    Attributes: ``renderer``, ``sceneHash`` (of `identity.scene_records`), ``settings`` (film and integrator, JSON),
+    ``seed`` (decimal; several after a merge, with commas) and ``samplesPerPixel``.
+    """
+    records = renderer.scene_records
+    return {
+        "renderer": f"wavefront {wavefront.__version__}",
+        "sceneHash": scene_hash(records),
+        "settings": json.dumps({"film": records["film"], "integrator": records["integrator"]}, sort_keys=True),
+        "seed": str(renderer.seed),  # text: a header has no 64-bit integers
+        "samplesPerPixel": renderer.sample_count,
+    }
 
 
 def describe_render(renderer: Renderer, source: str, started: float) -> dict:
@@ -107,7 +106,7 @@ def describe_render(renderer: Renderer, source: str, started: float) -> dict:
     seconds = max(s.render_seconds, 1e-9)
     return {
         "scene": str(source),
-        "scene_sha256": scene_hash(renderer.scene),
+        "scene_sha256": scene_hash(renderer.scene_records),
         "settings": {
             "film": msgspec.to_builtins(msgspec.structs.asdict(renderer.scene.film)),
             "integrator": msgspec.to_builtins(msgspec.structs.asdict(renderer.scene.integrator)),
@@ -156,12 +155,13 @@ def write_outputs(exr: Path, renderer: Renderer, exposure: float, account: dict)
     """
     exr, png, account_path = output_paths(exr)
     channels = renderer.film.channels()
+    attributes = image_attributes(renderer)
     overflow = None
     try:
-        write_exr(exr, channels, half=renderer.scene.film.precision == "half")
+        write_exr(exr, channels, half=renderer.scene.film.precision == "half", attributes=attributes)
     except HalfOverflowError as error:
         overflow = error
-        write_exr(exr, channels)
+        write_exr(exr, channels, attributes=attributes)
     write_png(png, tone_map(renderer.film.image(), exposure))
     with replacing(account_path) as temporary:
         temporary.write_text(json.dumps(account, indent=2) + "\n", encoding="utf-8")

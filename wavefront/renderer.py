@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 import resource
 import sys
@@ -14,6 +15,7 @@ import warp as wp
 
 from wavefront.errors import WavefrontError
 from wavefront.film import Film
+from wavefront.identity import scene_records
 from wavefront.integrator import (
     Worker,
     make_features,
@@ -160,6 +162,11 @@ class Renderer:
                 f"threads; at least {needed / 2**20:.0f} MiB is needed"
             )
         return int(capacity)
+
+    @functools.cached_property
+    def scene_records(self) -> dict:
+        """What this is a render of, see `identity.scene_records`. Read from the scene's files at first use."""
+        return scene_records(self.scene)
 
     @property
     def sample_count(self) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -121,13 +121,19 @@ def _load_hdr(path, where):
 # --- writing ---------------------------------------------------------------------------------------------------
 
 
-def write_exr(path: str | os.PathLike, channels: dict[str, np.ndarray], half: bool = False) -> None:
+def write_exr(
+    path: str | os.PathLike,
+    channels: dict[str, np.ndarray],
+    half: bool = False,
+    attributes: Mapping[str, int | float | str] | None = None,
+) -> None:
     """Writes an OpenEXR image (scan lines, ZIP); the file appears whole or not at all.
 
     Args:
         path: The file.
         channels: (H, W) arrays by channel name: ``R``, ``G``, ``B``, ``albedo.R``, ...
         half: 16-bit floats; else 32-bit.
+        attributes: Of the header, by name.
 
     Raises:
         HalfOverflowError: A finite value beyond 65504 in half precision.
@@ -147,7 +153,7 @@ def write_exr(path: str | os.PathLike, channels: dict[str, np.ndarray], half: bo
                 )
             pixels = pixels.astype(np.float16)
         data[name] = pixels
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header = dict(attributes or {}) | {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with replacing(path) as temporary:
         try:
             with OpenEXR.File(header, data) as file:
