@@ -27,7 +27,7 @@ def output_paths(exr: Path) -> tuple[Path, Path, Path]:
     return exr, exr.with_suffix(".png"), exr.with_suffix(".json")
 
 
-def check_writable(exr: Path) -> None:
+def check_image_path(exr: Path) -> None:
     """Refuses an output that cannot be written, before time is spent on it.
 
     Raises:
@@ -35,19 +35,28 @@ def check_writable(exr: Path) -> None:
     """
     if exr.suffix.lower() != ".exr":
         raise WavefrontError(f"{exr}: the output is an OpenEXR file; allowed: a name that ends in .exr")
-    if not exr.parent.is_dir():
-        raise WavefrontError(f"{exr}: the folder {exr.parent} does not exist")
     for path in output_paths(exr):
-        if path.is_dir():
-            raise WavefrontError(f"{path}: cannot be written: it is a folder")
-        if path.exists() and not os.access(path, os.W_OK):
-            raise WavefrontError(f"{path}: cannot be written: permission denied")
-    probe = exr.with_name(f".{exr.stem}.{os.getpid()}.probe")
+        check_writable(path)
+
+
+def check_writable(path: Path) -> None:
+    """Refuses a file that cannot be written: in a missing or read-only folder, or in the place of a folder.
+
+    Raises:
+        WavefrontError: Names the file.
+    """
+    if not path.parent.is_dir():
+        raise WavefrontError(f"{path}: the folder {path.parent} does not exist")
+    if path.is_dir():
+        raise WavefrontError(f"{path}: cannot be written: it is a folder")
+    if path.exists() and not os.access(path, os.W_OK):
+        raise WavefrontError(f"{path}: cannot be written: permission denied")
+    probe = path.with_name(f".{path.stem}.{os.getpid()}.probe")
     try:
         probe.touch()
         probe.unlink()
     except OSError as error:
-        raise WavefrontError(f"{exr}: cannot be written: {error.strerror or error}") from None
+        raise WavefrontError(f"{path}: cannot be written: {error.strerror or error}") from None
 
 
 def check_not_read(exr: Path, source: str | os.PathLike, scene: description.Scene) -> None:
@@ -150,8 +159,8 @@ def write_outputs(exr: Path, renderer: Renderer, exposure: float, account: dict)
     """Writes the three files, each under a temporary name first.
 
     Raises:
-        WavefrontError: A file cannot be written; or a value overflows half precision, in which case the image is
-            there in 32-bit floats all the same.
+        HalfOverflowError: A value overflows half precision; the image is there in 32-bit floats all the same.
+        WavefrontError: A file cannot be written.
     """
     exr, png, account_path = output_paths(exr)
     channels = renderer.film.channels()
@@ -166,4 +175,4 @@ def write_outputs(exr: Path, renderer: Renderer, exposure: float, account: dict)
     with replacing(account_path) as temporary:
         temporary.write_text(json.dumps(account, indent=2) + "\n", encoding="utf-8")
     if overflow is not None:
-        raise WavefrontError(f"{overflow}; nothing is lost: it was written as 32-bit floats")
+        raise HalfOverflowError(f"{overflow}; nothing is lost: it was written as 32-bit floats")
