@@ -14,6 +14,7 @@ import OpenEXR
 import pytest
 from PIL import Image
 
+from wavefront import __version__
 from wavefront.render import build_parser, main, parse_memory
 from wavefront.scene.images import write_exr
 
@@ -89,6 +90,23 @@ def test_writes_image_picture_and_account(scene, tmp_path, capsys):
     assert account["nonfinite"] == {"emission": 0, "escaped": 0, "direct": 0, "scatter": 0, "accumulate": 0}
     assert account["peak_memory_bytes"] > 1 << 20
     assert len(account["scene_sha256"]) == 64
+
+
+def test_the_header_says_how_the_image_was_made(scene, tmp_path, capsys):
+    def header(name, *arguments):
+        assert run(capsys, scene, "-o", tmp_path / name, "--size", "4x4", "--quiet", *arguments) == (0, "")
+        with OpenEXR.File(str(tmp_path / name), header_only=True) as file:
+            return dict(file.header())
+
+    seed = 2**64 - 1
+    one, two = header("a.exr", "--seed", seed, "--spp", 3), header("b.exr", "--spp", 2, "--half")
+    assert (one["samplesPerPixel"], one["seed"], one["renderer"]) == (3, str(seed), f"wavefront {__version__}")
+    assert (two["samplesPerPixel"], two["seed"]) == (2, "0")
+    # Of one scene, whatever the number of samples and how they are written.
+    assert one["sceneHash"] == two["sceneHash"] == json.loads((tmp_path / "a.json").read_text())["scene_sha256"]
+    assert one["settings"] == two["settings"]
+    assert json.loads(one["settings"])["integrator"]["max_depth"] == 4
+    assert header("c.exr", "--spp", 2, "--max-depth", 3)["sceneHash"] != one["sceneHash"]
 
 
 def test_command_line_overrides_the_scene(scene, tmp_path, capsys):

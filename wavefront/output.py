@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 import os
 import platform
@@ -17,6 +16,7 @@ import warp as wp
 import wavefront
 from wavefront.errors import WavefrontError
 from wavefront.film import INTEGERS, Film, row_blocks
+from wavefront.identity import scene_hash
 from wavefront.renderer import Renderer, peak_memory_bytes
 from wavefront.scene import description
 from wavefront.scene.images import HalfOverflowError, replacing, write_exr_blocks, write_png_blocks
@@ -28,7 +28,7 @@ def output_paths(exr: Path) -> tuple[Path, Path, Path]:
     return exr, exr.with_suffix(".png"), exr.with_suffix(".json")
 
 
-def check_writable(exr: Path) -> None:
+def check_image_path(exr: Path) -> None:
     """Refuses an output that cannot be written, before time is spent on it.
 
     Raises:
@@ -36,19 +36,28 @@ def check_writable(exr: Path) -> None:
     """
     if exr.suffix.lower() != ".exr":
         raise WavefrontError(f"{exr}: the output is an OpenEXR file; allowed: a name that ends in .exr")
-    if not exr.parent.is_dir():
-        raise WavefrontError(f"{exr}: the folder {exr.parent} does not exist")
     for path in output_paths(exr):
-        if path.is_dir():
-            raise WavefrontError(f"{path}: cannot be written: it is a folder")
-        if path.exists() and not os.access(path, os.W_OK):
-            raise WavefrontError(f"{path}: cannot be written: permission denied")
-    probe = exr.with_name(f".{exr.stem}.{os.getpid()}.probe")
+        check_writable(path)
+
+
+def check_writable(path: Path) -> None:
+    """Refuses a file that cannot be written: in a missing or read-only folder, or in the place of a folder.
+
+    Raises:
+        WavefrontError: Names the file.
+    """
+    if not path.parent.is_dir():
+        raise WavefrontError(f"{path}: the folder {path.parent} does not exist")
+    if path.is_dir():
+        raise WavefrontError(f"{path}: cannot be written: it is a folder")
+    if path.exists() and not os.access(path, os.W_OK):
+        raise WavefrontError(f"{path}: cannot be written: permission denied")
+    probe = path.with_name(f".{path.stem}.{os.getpid()}.probe")
     try:
         probe.touch()
         probe.unlink()
     except OSError as error:
-        raise WavefrontError(f"{exr}: cannot be written: {error.strerror or error}") from None
+        raise WavefrontError(f"{path}: cannot be written: {error.strerror or error}") from None
 
 
 def check_not_read(exr: Path, source: str | os.PathLike, scene: description.Scene) -> None:
@@ -79,21 +88,22 @@ def tone_map(image: np.ndarray, exposure: float = 0.0) -> np.ndarray:
     return (encoded * 255.0 + 0.5).astype(np.uint8)
 
 
-def scene_hash(scene: description.Scene) -> str:
-    """SHA-256 of a scene: its records, with the contents of files in the place of their paths."""
-    plain = msgspec.to_builtins(scene)
-    files = {}
-    for _, record in walk(scene):
-        file = getattr(record, "file", None)
-        if file and file not in files:
-            files[file] = hashlib.sha256(Path(file).read_bytes()).hexdigest()
+def image_attributes(renderer: Renderer) -> dict[str, int | str]:
+    """What the header of an image says of its making, for those who combine images (see `tools.merge`).
 
-    def replace(value):
-        if isinstance(value, dict):
-            return {k: files.get(v, v) if k == "file" else replace(v) for k, v in value.items()}
-        return [replace(v) for v in value] if isinstance(value, list) else value
-
-    return hashlib.sha256(json.dumps(replace(plain), sort_keys=True).encode()).hexdigest()
+    Attributes: ``renderer``, ``sceneHash`` (of `identity.scene_records`), ``settings`` (film and integrator, JSON),
+    ``seed`` (decimal; several after a merge, with commas), ``samplesPerPixel``, and the format's own
+    ``pixelAspectRatio``.
+    """
+    records = renderer.scene_records
+    return {
+        "renderer": f"wavefront {wavefront.__version__}",
+        "sceneHash": scene_hash(records),
+        "settings": json.dumps({"film": records["film"], "integrator": records["integrator"]}, sort_keys=True),
+        "seed": str(renderer.seed),  # text: a header has no 64-bit integers
+        "samplesPerPixel": renderer.sample_count,
+        "PixelAspectRatio": renderer.scene.film.pixel_aspect,
+    }
 
 
 def describe_render(renderer: Renderer, source: str, started: float) -> dict:
@@ -108,7 +118,7 @@ def describe_render(renderer: Renderer, source: str, started: float) -> dict:
     seconds = max(s.render_seconds, 1e-9)
     return {
         "scene": str(source),
-        "scene_sha256": scene_hash(renderer.scene),
+        "scene_sha256": scene_hash(renderer.scene_records),
         "settings": {
             "film": msgspec.to_builtins(msgspec.structs.asdict(renderer.scene.film)),
             "integrator": msgspec.to_builtins(msgspec.structs.asdict(renderer.scene.integrator)),
@@ -149,21 +159,7 @@ def describe_render(renderer: Renderer, source: str, started: float) -> dict:
     }
 
 
-def exr_attributes(renderer: Renderer, account: dict) -> dict[str, int | float | str]:
-    """What the header of OUT.exr says of the render.
-
-    ``samplesPerPixel`` (int), ``seed`` (text: it has 64 bits), ``sceneSHA256``, ``software`` and ``pixelAspectRatio``.
-    """
-    return {
-        "samplesPerPixel": renderer.sample_count,
-        "seed": str(renderer.seed),
-        "sceneSHA256": account["scene_sha256"],
-        "Software": f"wavefront {wavefront.__version__}",
-        "PixelAspectRatio": renderer.scene.film.pixel_aspect,
-    }
-
-
-def write_film(exr: Path, renderer: Renderer, half: bool, account: dict) -> None:
+def write_film(exr: Path, renderer: Renderer, half: bool) -> None:
     """Writes the channels of the film, from the film itself in blocks of rows.
 
     Indices and counts are 32-bit floats whatever `half` says.
@@ -180,7 +176,7 @@ def write_film(exr: Path, renderer: Renderer, half: bool, account: dict) -> None
         (record.width, record.height),
         {name: "half" if half and name not in INTEGERS else "float" for name in names},
         (film.rows(first, last) for first, last in row_blocks(film.width, film.height)),
-        exr_attributes(renderer, account),
+        image_attributes(renderer),
     )
 
 
@@ -199,18 +195,18 @@ def write_outputs(exr: Path, renderer: Renderer, exposure: float, account: dict)
     """Writes the three files, each under a temporary name first.
 
     Raises:
-        WavefrontError: A file cannot be written; or a value overflows half precision, in which case the image is
-            there in 32-bit floats all the same.
+        HalfOverflowError: A value overflows half precision; the image is there in 32-bit floats all the same.
+        WavefrontError: A file cannot be written.
     """
     exr, png, account_path = output_paths(exr)
     overflow = None
     try:
-        write_film(exr, renderer, renderer.scene.film.precision == "half", account)
+        write_film(exr, renderer, renderer.scene.film.precision == "half")
     except HalfOverflowError as error:
         overflow = error
-        write_film(exr, renderer, False, account)
+        write_film(exr, renderer, False)
     write_picture(png, renderer.film, exposure)
     with replacing(account_path) as temporary:
         temporary.write_text(json.dumps(account, indent=2) + "\n", encoding="utf-8")
     if overflow is not None:
-        raise WavefrontError(f"{overflow}; nothing is lost: it was written as 32-bit floats")
+        raise HalfOverflowError(f"{overflow}; nothing is lost: it was written as 32-bit floats")

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
+import os
 import re
 import signal
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -15,14 +18,24 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 
 import wavefront
+from wavefront.checkpoint import CheckpointError, CheckpointWriter
 from wavefront.errors import WavefrontError
 from wavefront.film import CHANNELS
-from wavefront.output import check_not_read, check_writable, describe_render, write_outputs
+from wavefront.output import (
+    check_image_path,
+    check_not_read,
+    check_writable,
+    describe_render,
+    output_paths,
+    write_outputs,
+)
 from wavefront.renderer import Renderer
 from wavefront.scene import json_format, load_scene
+from wavefront.scene.images import HalfOverflowError
 
 EXIT_ERROR = 2
-EXIT_INTERRUPTED = 130
+EXIT_SIGNAL = 128  # plus the number of the signal
+CHECKPOINT_SECONDS = 300.0
 
 DESCRIPTION = """\
 Render a scene: our own scene.json (see --schema) or Mitsuba's scene.xml.
@@ -105,6 +118,16 @@ def build_parser() -> argparse.ArgumentParser:
         "--define", action="append", default=[], metavar="NAME=VALUE", help="value of a $NAME of a Mitsuba scene"
     )
 
+    long = parser.add_argument_group("long renders")
+    long.add_argument("--checkpoint", metavar="FILE", help="save what a later --resume needs, from time to time")
+    long.add_argument("--every", type=float, metavar="S", help="seconds between checkpoints; default 300")
+    long.add_argument(
+        "--resume",
+        metavar="FILE",
+        help="go on from a checkpoint, up to --spp in total or for --time more; "
+        "with --checkpoint of the same FILE, a missing one is a render that begins",
+    )
+
     machine = parser.add_argument_group("machine")
     machine.add_argument("--device", default="cpu", help="cpu (default), cuda or cuda:N")
     machine.add_argument("--threads", type=int, metavar="N", help="workers on the CPU device; default: all cores")
@@ -155,26 +178,40 @@ def definitions_from(arguments: argparse.Namespace) -> dict[str, str]:
 
 
 class Interrupt:
-    """Ctrl-C asks the render to stop after its pass; a second one ends the program at once."""
+    """Ctrl-C, or SIGTERM as clusters send it, asks the render to stop after its pass; a second one ends the program."""
 
     def __init__(self, console: Console):
-        self.requested, self.console = False, console
+        self.requested, self.console = 0, console  # the signal's number
 
     def __enter__(self):
-        self.previous = signal.signal(signal.SIGINT, self._handle)
+        self.previous = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
         return self
 
     def __exit__(self, *_):
-        signal.signal(signal.SIGINT, self.previous)
+        for number, handler in self.previous.items():
+            signal.signal(number, handler)
 
-    def _handle(self, *_):
-        self.requested = True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+    def _handle(self, number, _):
+        self.requested = number
+        signal.signal(number, self.previous[number])
         self.console.print("stopping after this pass; Ctrl-C again to stop without saving")
 
 
-def run_with_progress(renderer: Renderer, console: Console, spp: int | None, seconds: float | None) -> bool:
-    """Renders with a progress bar; returns whether it was interrupted."""
+def run_with_progress(
+    renderer: Renderer,
+    console: Console,
+    spp: int | None,
+    seconds: float | None,
+    checkpoints: CheckpointWriter | None = None,
+) -> int:
+    """Renders up to `spp` samples per pixel in total, or for `seconds` from now, with a progress bar.
+
+    Returns:
+        The number of the signal that interrupted it, or 0.
+    """
+    if spp is not None and spp <= renderer.sample_count:
+        return 0
+    begun = renderer.statistics.render_seconds  # of earlier processes
     columns = (
         TextColumn("{task.fields[spp]}"),
         BarColumn(),
@@ -196,15 +233,60 @@ def run_with_progress(renderer: Renderer, console: Console, spp: int | None, sec
         def update(r: Renderer) -> bool:
             s = r.statistics
             rate = (s.rays + s.shadow_rays) / max(s.render_seconds, 1e-9)
-            completed = min(s.render_seconds, seconds) if seconds else s.sample_count
+            completed = min(s.render_seconds - begun, seconds) if seconds else s.sample_count
             wanted = "" if seconds else f"/{spp}"
             progress.update(
                 task, completed=completed, spp=f"{s.sample_count}{wanted} spp", rate=f"{rate / 1e6:.2f} Mrays/s"
             )
-            return interrupt.requested
+            if checkpoints is not None:
+                checkpoints.after_pass()
+            return bool(interrupt.requested)
 
-        renderer.add_samples(spp=spp, seconds=seconds, callback=update)
+        renderer.add_samples(spp=spp and spp - renderer.sample_count, seconds=seconds, callback=update)
         return interrupt.requested
+
+
+def check_checkpoints(arguments: argparse.Namespace, output: Path) -> tuple[Path | None, Path | None]:
+    """The checkpoint to resume from and the one to write, either of which may be None.
+
+    Raises:
+        WavefrontError: A missing file, one that would be lost, or one that cannot be written.
+    """
+    checkpoint, resume = (Path(name) if name else None for name in (arguments.checkpoint, arguments.resume))
+    if checkpoint is None:
+        if arguments.every is not None:
+            raise WavefrontError("--every is for --checkpoint, which is missing")
+    else:
+        if arguments.every is not None and not arguments.every > 0.0:
+            raise WavefrontError(f"--every {arguments.every:g}; allowed: more than 0")
+        if checkpoint in output_paths(output):
+            raise WavefrontError(f"{checkpoint}: the checkpoint would replace the image; choose another name")
+        same = resume is not None and os.path.realpath(resume) == os.path.realpath(checkpoint)
+        if same:
+            resume = checkpoint if checkpoint.exists() else None
+        elif checkpoint.exists():
+            raise WavefrontError(
+                f"{checkpoint}: exists; to go on from it, add --resume {checkpoint}; to begin again, remove it"
+            )
+        check_writable(checkpoint)
+    if resume is not None and not resume.is_file():
+        raise WavefrontError(f"{resume}: there is no such checkpoint to resume from")
+    return resume, checkpoint
+
+
+def rescue(renderer: Renderer, output: Path, checkpoints: CheckpointWriter | None) -> str:
+    """Where the samples are after the image could not be written: the end of the error message."""
+    if checkpoints is not None and checkpoints.saved_samples == renderer.sample_count:
+        return f"nothing is lost: --resume {checkpoints.path} writes it"
+    name = f"{output.stem}.{os.getpid()}.checkpoint"
+    for place in (output.with_name(name), Path(tempfile.gettempdir()) / name):
+        with contextlib.suppress(CheckpointError):
+            renderer.save_checkpoint(place)
+            return f"nothing is lost: --resume {place} writes it"
+    if checkpoints is not None and checkpoints.saved_samples:
+        saved = f"{checkpoints.saved_samples} of {renderer.sample_count} samples"
+        return f"--resume {checkpoints.path} goes on from {saved}"
+    return "and no checkpoint could be written either"
 
 
 def print_profile(renderer: Renderer, console: Console) -> None:
@@ -239,7 +321,8 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
     if seconds is not None and not 0.0 < seconds < float("inf"):
         raise WavefrontError(f"--time {seconds:g}; allowed: more than 0")
     output = Path(arguments.output or Path(arguments.scene).with_suffix(".exr").name)
-    check_writable(output)
+    check_image_path(output)
+    resume, checkpoint = check_checkpoints(arguments, output)
     scene = load_scene(arguments.scene, overrides_from(arguments), definitions_from(arguments), warn)
     check_not_read(output, arguments.scene, scene)
     renderer = Renderer(
@@ -255,8 +338,25 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
     for note in renderer.device_scene.notes:
         warn(note)
     spp = None if seconds else scene.integrator.spp
-    interrupted = run_with_progress(renderer, console, spp, seconds)
-    write_outputs(output, renderer, arguments.exposure, describe_render(renderer, arguments.scene, started))
+    if resume is not None:
+        renderer.load_checkpoint(resume)
+        message = f"{resume}: resuming after {renderer.sample_count} samples per pixel"
+        console.print(message, highlight=False, soft_wrap=True)
+        if spp is not None and spp < renderer.sample_count:
+            warn(f"{resume} holds more samples than the {spp} asked for, and all are in the image")
+    checkpoints = None
+    if checkpoint is not None:
+        saved = renderer.sample_count if resume == checkpoint else None
+        checkpoints = CheckpointWriter(renderer, checkpoint, arguments.every or CHECKPOINT_SECONDS, warn, saved)
+    interrupted = run_with_progress(renderer, console, spp, seconds, checkpoints)
+    if checkpoints is not None:
+        checkpoints.write()
+    try:
+        write_outputs(output, renderer, arguments.exposure, describe_render(renderer, arguments.scene, started))
+    except HalfOverflowError:
+        raise
+    except (WavefrontError, MemoryError) as error:
+        raise WavefrontError(f"{error or 'out of memory'}; {rescue(renderer, output, checkpoints)}") from None
     for stage, count in renderer.statistics.nonfinite.items():
         if count:
             warn(f"{count} contributions of the {stage} stage were not finite or negative, and were left out")
@@ -269,7 +369,7 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
         highlight=False,
         soft_wrap=True,
     )
-    return EXIT_INTERRUPTED if interrupted else 0
+    return EXIT_SIGNAL + interrupted if interrupted else 0
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -289,7 +389,7 @@ def main(argv: list[str] | None = None) -> int:
         return EXIT_ERROR
     except KeyboardInterrupt:
         print("interrupted: nothing was saved", file=sys.stderr)
-        return EXIT_INTERRUPTED
+        return EXIT_SIGNAL + signal.SIGINT
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import os
 import resource
@@ -13,8 +14,11 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
+import wavefront
+from wavefront.checkpoint import film_sections, read_checkpoint, write_checkpoint
 from wavefront.errors import WavefrontError
 from wavefront.film import BLOCK_PIXELS, CHANNELS, Film
+from wavefront.identity import scene_records
 from wavefront.integrator import (
     Worker,
     make_features,
@@ -127,6 +131,7 @@ class Renderer:
         self.features = make_features(scene, self.device_scene)
         self.kernels = make_kernels(self.features)
         self.statistics = Statistics()
+        self._resumed = Statistics()  # what the statistics were in the checkpoint that was loaded
         self._compile(on_compile)
 
         film = scene.film
@@ -188,6 +193,11 @@ class Renderer:
                 f"threads; at least {math.ceil(needed / 2**20)} MiB is needed{rest}"
             )
         return int(capacity)
+
+    @functools.cached_property
+    def scene_records(self) -> dict:
+        """What this is a render of, see `identity.scene_records`. Read from the scene's files at first use."""
+        return scene_records(self.scene)
 
     @property
     def sample_count(self) -> int:
@@ -251,6 +261,45 @@ class Renderer:
         self.add_samples(spp, seconds, callback)
         return self.film.image()
 
+    def _identity(self) -> dict:
+        """What must be equal for a checkpoint to be continued; its samples would be others otherwise."""
+        return {
+            "wavefront": wavefront.__version__,
+            "warp": wp.config.version,
+            "device": self.device.split(":")[0],
+            "seed": self.seed,
+            "scene": self.scene_records,
+        }
+
+    def save_checkpoint(self, path: str | os.PathLike) -> None:
+        """Writes all that `load_checkpoint` needs, see `wavefront.checkpoint`; `path` is replaced whole or not at all.
+
+        Raises:
+            CheckpointError: The file cannot be written; what was there is still there.
+        """
+        about = {
+            "identity": self._identity(),
+            "statistics": dataclasses.asdict(self.statistics),
+        }
+        write_checkpoint(path, about, film_sections(self.film))
+
+    def load_checkpoint(self, path: str | os.PathLike) -> None:
+        """Goes on from a checkpoint of the same scene, settings, seed, version and kind of device.
+
+        What follows is the same to the last bit as without the interruption. The number of threads, the memory budget
+        and the samples asked for may be others.
+
+        Raises:
+            CheckpointError: Missing, damaged, or of another render, with what differs; nothing has changed then.
+        """
+        if self.sample_count:
+            raise WavefrontError(f"{path}: a checkpoint must be loaded before the first sample")
+        about = read_checkpoint(path, self._identity(), film_sections(self.film))
+        self._resumed = Statistics(**about["statistics"])
+        self.film.sample_count = self._resumed.sample_count
+        self.statistics.render_seconds = self._resumed.render_seconds
+        self._collect()
+
     def _pass(self, samples: int) -> None:
         film = self.film
         run_tiles(self.workers, plan_tiles(film.width, film.height, self.capacity, film.sample_count, samples))
@@ -264,9 +313,12 @@ class Renderer:
     def _collect(self) -> None:
         s = self.statistics
         totals = sum(worker.queues.totals.numpy() for worker in self.workers)
+        before = self._resumed
         s.sample_count = self.film.sample_count
-        s.paths, s.rays, s.shadow_rays = (int(totals[i]) for i in (TOTAL_PATHS, TOTAL_RAYS, TOTAL_SHADOW_RAYS))
-        s.stage_seconds, s.nonfinite = {}, {}
+        s.paths = before.paths + int(totals[TOTAL_PATHS])
+        s.rays = before.rays + int(totals[TOTAL_RAYS])
+        s.shadow_rays = before.shadow_rays + int(totals[TOTAL_SHADOW_RAYS])
+        s.stage_seconds, s.nonfinite = dict(before.stage_seconds), dict(before.nonfinite)
         for worker in self.workers:
             for stage, value in worker.stage_seconds.items():
                 s.stage_seconds[stage] = s.stage_seconds.get(stage, 0.0) + value

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -128,7 +128,7 @@ def write_exr(
     path: str | os.PathLike,
     channels: dict[str, np.ndarray],
     half: bool = False,
-    attributes: dict[str, int | float | str] | None = None,
+    attributes: Mapping[str, int | float | str] | None = None,
 ) -> None:
     """Writes an OpenEXR image (scan lines, ZIP); the file appears whole or not at all.
 
@@ -156,7 +156,7 @@ def write_exr_blocks(
     size: tuple[int, int],
     formats: dict[str, str],
     blocks: Iterable[dict[str, np.ndarray]],
-    attributes: dict[str, int | float | str] | None = None,
+    attributes: Mapping[str, int | float | str] | None = None,
 ) -> None:
     """Writes an OpenEXR image (scan lines, ZIP) block by block; the file appears whole or not at all.
 
