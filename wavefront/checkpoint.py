@@ -132,13 +132,16 @@ def _reason(error: BaseException) -> str:
 # --- reading -----------------------------------------------------------------------------------------------------
 
 
-def read_checkpoint(path: str | os.PathLike, identity: dict, sections: Sections) -> dict:
+def read_checkpoint(
+    path: str | os.PathLike, identity: dict, sections: Sections, check: Callable[[dict], None] = lambda about: None
+) -> dict:
     """Reads a checkpoint into `sections`, which are changed only if the whole file is sound and is of this render.
 
     Args:
         path: The file.
         identity: What `about["identity"]` must be.
         sections: Arrays to fill, of the shapes and types that were written.
+        check: Called with `about` before anything is changed; may raise a CheckpointError.
 
     Returns:
         `about`.
@@ -156,6 +159,7 @@ def read_checkpoint(path: str | os.PathLike, identity: dict, sections: Sections)
             with zipfile.ZipFile(file) as archive:
                 about = json.loads(archive.read(_ABOUT))
                 _check_identity(path, about, identity)
+                check(about)
                 damaged = archive.testzip()
                 if damaged is not None:
                     raise ValueError(f"the checksum of {damaged} is wrong")

@@ -155,7 +155,9 @@ class Worker:
         capacity: int,
         device: str,
         profile: bool = False,
+        film_stride: int | None = None,  # pixels from row to row of the film's arrays; default: its width
     ):
+        self.film = film
         self.device, self.capacity = device, capacity
         self.captured = None  # the graph of a pass, on CUDA
         self.capturing = False
@@ -176,6 +178,7 @@ class Worker:
         scale = FILTER_SCALES[features.filter](scene.film.filter)
         max_depth, rr_depth = scene.integrator.max_depth, scene.integrator.rr_depth or 0
         width, sums, seed = film.width, film.arrays, wp.uint64(seed)
+        stride = width if film_stride is None else film_stride
         tables = geometry, materials, textures, lights
         # In the order of the kernels' parameters.
         arguments = {
@@ -183,13 +186,13 @@ class Worker:
             "intersect": [geometry, paths, rays, max_depth, surfaces, hits, escaped, emissive, counters],
             "escaped": [lights, paths, escaped, counters],
             "emission": [geometry, lights, textures, paths, surfaces, emissive, counters],
-            "aov": [materials, textures, paths, surfaces, tile, width, sums],
+            "aov": [materials, textures, paths, surfaces, tile, stride, sums],
             "direct": [*tables, paths, surfaces, hits, seed, shadow_rays, shadow, counters],
             "shadow": [geometry, shadow_rays, shadow, paths],
             "drain": [counters, totals],
             "scatter": [materials, textures, surfaces, hits, rr_depth, seed, paths, rays, counters],
             "advance": [counters],
-            "accumulate": [paths, tile, width, sums, counters],
+            "accumulate": [paths, tile, stride, sums, counters],
         }
         self.commands = {
             stage: wp.launch(kernel, dim=capacity, inputs=arguments[stage], device=device, record_cmd=True)

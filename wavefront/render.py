@@ -11,6 +11,7 @@ import signal
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from rich.console import Console
@@ -30,8 +31,9 @@ from wavefront.output import (
     write_outputs,
 )
 from wavefront.renderer import Renderer
-from wavefront.scene import json_format, load_scene
+from wavefront.scene import Scene, json_format, load_scene
 from wavefront.scene.images import HalfOverflowError
+from wavefront.strict import NonFiniteError
 
 EXIT_ERROR = 2
 EXIT_SIGNAL = 128  # plus the number of the signal
@@ -47,7 +49,9 @@ EXAMPLES = """\
 examples:
   python -m wavefront.render scenes/cornell-box.json
   python -m wavefront.render scene.xml -o out.exr --spp 256 --size 640x360 --aov albedo,normal
-  python -m wavefront.render scene.json --time 60 --set integrator.max_depth=6 --set film.filter.type=tent"""
+  python -m wavefront.render scene.json --time 60 --set integrator.max_depth=6 --set film.filter.type=tent
+  python -m wavefront.render scene.json --spp 100000 --checkpoint night --resume night
+  python -m wavefront.render scene.json --pixel 120,60 --sample 3 --trace"""
 
 
 def parse_memory(text: str) -> int:
@@ -76,6 +80,13 @@ def parse_crop(text: str) -> tuple[int, ...]:
     if match is None:
         raise argparse.ArgumentTypeError(f"{text!r} is not a window; allowed: WIDTHxHEIGHT+X+Y, such as 64x48+100+20")
     return tuple(map(int, match.groups()))
+
+
+def parse_pixel(text: str) -> tuple[int, int]:
+    x, _, y = text.partition(",")
+    if not (x.isascii() and x.isdigit() and y.isascii() and y.isdigit()):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a pixel; allowed: X,Y, such as 12,7")
+    return int(x), int(y)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -128,6 +139,14 @@ def build_parser() -> argparse.ArgumentParser:
         "with --checkpoint of the same FILE, a missing one is a render that begins",
     )
 
+    path = parser.add_argument_group(
+        "one path", "Added to the command of a render: traces a path of it again, in place of rendering and writing."
+    )
+    path.add_argument("--pixel", type=parse_pixel, metavar="X,Y", help="print the radiance of one sample of a pixel")
+    path.add_argument("--sample", type=int, metavar="N", help="which one; default 0")
+    path.add_argument("--trace", action="store_true", help="print the path, vertex by vertex")
+    path.add_argument("--json", action="store_true", help="print the path as JSON")
+
     machine = parser.add_argument_group("machine")
     machine.add_argument("--device", default="cpu", help="cpu (default), cuda or cuda:N")
     machine.add_argument("--threads", type=int, metavar="N", help="workers on the CPU device; default: all cores")
@@ -137,6 +156,9 @@ def build_parser() -> argparse.ArgumentParser:
         default="4G",
         metavar="SIZE",
         help="most memory: of the process (cpu), of film and paths (cuda); default 4G",
+    )
+    machine.add_argument(
+        "--strict", action="store_true", help="a contribution that is not finite is an error that names its path"
     )
     machine.add_argument("--profile", action="store_true", help="print the time of every stage")
     machine.add_argument("--quiet", action="store_true", help="print errors only")
@@ -304,6 +326,38 @@ def print_profile(renderer: Renderer, console: Console) -> None:
     console.print(table)
 
 
+def make_renderer(arguments: argparse.Namespace, scene: Scene, console: Console) -> Renderer:
+    """The renderer of a scene as the command line says."""
+    return Renderer(
+        scene,
+        device=arguments.device,
+        threads=arguments.threads,
+        memory=arguments.memory,
+        whole_process=True,
+        seed=arguments.seed,
+        strict=arguments.strict,
+        profile=arguments.profile,
+        on_compile=lambda message: console.print(message, highlight=False),
+    )
+
+
+def run_trace(arguments: argparse.Namespace, console: Console, warn: Callable[[str], None]) -> int:
+    """Prints one path; returns the exit status.
+
+    Raises:
+        WavefrontError: With the one line that the user needs.
+    """
+    scene = load_scene(arguments.scene, overrides_from(arguments), definitions_from(arguments), warn)
+    trace = make_renderer(arguments, scene, console).trace(*arguments.pixel, arguments.sample or 0)
+    if arguments.json:
+        print(trace.to_json())
+    elif arguments.trace:
+        Console(highlight=False).print(trace.to_table())
+    else:
+        print(*(f"{value:.9g}" for value in trace.L))
+    return 0
+
+
 def run(arguments: argparse.Namespace, console: Console) -> int:
     """Renders as the command line says; returns the exit status.
 
@@ -314,6 +368,12 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
     def warn(message: str) -> None:
         console.print(f"warning: {message}", markup=False, highlight=False, soft_wrap=True)
 
+    if arguments.pixel is not None:
+        return run_trace(arguments, console, warn)
+    for option in ("sample", "trace", "json"):
+        value = getattr(arguments, option)
+        if value is not None and value is not False:
+            raise WavefrontError(f"--{option} is for --pixel, which is missing")
     started = time.perf_counter()
     seconds = arguments.time
     if arguments.spp is not None and arguments.spp < 1:
@@ -325,16 +385,7 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
     resume, checkpoint = check_checkpoints(arguments, output)
     scene = load_scene(arguments.scene, overrides_from(arguments), definitions_from(arguments), warn)
     check_not_read(output, arguments.scene, scene)
-    renderer = Renderer(
-        scene,
-        device=arguments.device,
-        threads=arguments.threads,
-        memory=arguments.memory,
-        whole_process=True,
-        seed=arguments.seed,
-        profile=arguments.profile,
-        on_compile=lambda message: console.print(message, highlight=False),
-    )
+    renderer = make_renderer(arguments, scene, console)
     for note in renderer.device_scene.notes:
         warn(note)
     spp = None if seconds else scene.integrator.spp
@@ -348,7 +399,12 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
     if checkpoint is not None:
         saved = renderer.sample_count if resume == checkpoint else None
         checkpoints = CheckpointWriter(renderer, checkpoint, arguments.every or CHECKPOINT_SECONDS, warn, saved)
-    interrupted = run_with_progress(renderer, console, spp, seconds, checkpoints)
+    try:
+        interrupted = run_with_progress(renderer, console, spp, seconds, checkpoints)
+    except NonFiniteError as error:
+        saved = checkpoints is not None and checkpoints.saved_samples
+        kept = f"; {checkpoint} holds the {saved} samples before" if saved else ""
+        raise WavefrontError(f"{error}; no image was written{kept}") from None
     if checkpoints is not None:
         checkpoints.write()
     try:
@@ -359,7 +415,10 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
         raise WavefrontError(f"{error or 'out of memory'}; {rescue(renderer, output, checkpoints)}") from None
     for stage, count in renderer.statistics.nonfinite.items():
         if count:
-            warn(f"{count} contributions of the {stage} stage were not finite or negative, and were left out")
+            warn(
+                f"{count} contributions of the {stage} stage were not finite or negative, and were left out; "
+                "--strict names the first"
+            )
     if arguments.profile:
         print_profile(renderer, console)
     s = renderer.statistics

@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 import wavefront
-from wavefront.checkpoint import film_sections, read_checkpoint, write_checkpoint
+from wavefront.checkpoint import CheckpointError, film_sections, read_checkpoint, write_checkpoint
 from wavefront.errors import WavefrontError
 from wavefront.film import BLOCK_PIXELS, CHANNELS, Film
 from wavefront.identity import scene_records
@@ -33,6 +33,8 @@ from wavefront.scene.device import upload_scene
 from wavefront.scene.json_format import checked
 from wavefront.scene.lookup import bsdf_of_shape
 from wavefront.scene.validate import validate
+from wavefront.strict import find_nonfinite
+from wavefront.trace import PathTrace, TraceWorker
 
 CPU_CAPACITY = 1 << 14  # paths in flight per worker: their state stays in a core's second-level cache
 CUDA_CAPACITY = 1 << 21
@@ -100,6 +102,7 @@ class Renderer:
         whole_process: On the CPU device, the budget is for all that the process holds: what it holds already and what
             writing the film takes come off it.
         seed: Of the random numbers. Same seed and device, same image.
+        strict: A contribution that is not finite or negative is an error that names the path; else it is counted.
         profile: On CUDA, time every stage, at the price of a synchronisation after each.
         on_compile: Called with a message before kernels are compiled.
 
@@ -116,6 +119,7 @@ class Renderer:
         memory: int = DEFAULT_MEMORY,
         whole_process: bool = False,
         seed: int = 0,
+        strict: bool = False,
         profile: bool = False,
         on_compile: Callable[[str], None] | None = None,
     ):
@@ -125,12 +129,13 @@ class Renderer:
             raise WavefrontError(f"{threads} threads; allowed: 1 or more")
         scene = checked(scene)  # a scene built in Python gets the checks that a file gets, and a copy is kept
         self.warnings = validate(scene)
-        self.scene, self.device, self.seed = scene, resolve_device(device), seed
+        self.scene, self.device, self.seed, self.strict = scene, resolve_device(device), seed, strict
         self.device_scene = upload_scene(scene, self.device)
         self.warnings += self.device_scene.notes
         self.features = make_features(scene, self.device_scene)
         self.kernels = make_kernels(self.features)
         self.statistics = Statistics()
+        self._trace_worker: TraceWorker | None = None
         self._resumed = Statistics()  # what the statistics were in the checkpoint that was loaded
         self._compile(on_compile)
 
@@ -219,6 +224,7 @@ class Renderer:
 
         Raises:
             WavefrontError: `spp` or `seconds` is not positive.
+            NonFiniteError: In a strict render, at the end of the pass.
         """
         if spp is not None and spp < 1:
             raise WavefrontError(f"spp {spp}; allowed: 1 or more")
@@ -294,7 +300,16 @@ class Renderer:
         """
         if self.sample_count:
             raise WavefrontError(f"{path}: a checkpoint must be loaded before the first sample")
-        about = read_checkpoint(path, self._identity(), film_sections(self.film))
+
+        def check(about: dict) -> None:
+            left_out = sum(about["statistics"]["nonfinite"].values())
+            if self.strict and left_out:
+                raise CheckpointError(
+                    f"{path}: {left_out} contributions of its samples were not finite or negative and were left out; "
+                    "allowed: none in a strict render"
+                )
+
+        about = read_checkpoint(path, self._identity(), film_sections(self.film), check)
         self._resumed = Statistics(**about["statistics"])
         self.film.sample_count = self._resumed.sample_count
         self.statistics.render_seconds = self._resumed.render_seconds
@@ -307,8 +322,25 @@ class Renderer:
             wp.synchronize_device(self.device)
         for worker in self.workers:
             worker.check_status()
+        first, left_out = film.sample_count, sum(self.statistics.nonfinite.values())
         film.sample_count += samples
         self._collect()
+        if self.strict and sum(self.statistics.nonfinite.values()) > left_out:
+            raise find_nonfinite(self, first, samples)
+
+    def trace(self, x: int, y: int, sample: int = 0) -> PathTrace:
+        """Traces one path of a pixel again, whether or not it is in the film, and says what happens at each vertex.
+
+        Args:
+            x, y: Pixel, from the upper left corner.
+            sample: From 0.
+
+        Raises:
+            WavefrontError: No such pixel or sample.
+        """
+        if self._trace_worker is None:
+            self._trace_worker = TraceWorker(self)
+        return self._trace_worker.trace(x, y, sample)
 
     def _collect(self) -> None:
         s = self.statistics

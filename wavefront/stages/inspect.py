@@ -1,0 +1,66 @@
+"""What the other stages decide and do not keep, told again for one path: its hit, and the light that it sampled."""
+
+from __future__ import annotations
+
+import functools
+
+import warp as wp
+
+from wavefront.accel.mesh_query import Geometry, Hit, make_intersector
+from wavefront.bsdf.dispatch import is_smooth
+from wavefront.bsdf.tables import MaterialTables
+from wavefront.light.sampling import LightSample, make_light_sampler, select_light
+from wavefront.light.tables import LightTables
+from wavefront.queues import DEPTH, Paths, Surfaces
+from wavefront.rng import PURPOSE_LIGHT, uniform4
+from wavefront.texture import TextureTables
+
+
+@functools.cache
+def make_inspect_hit(triangles: bool, spheres: bool):
+    """Kernel that finds the primitive which the ray in slot 0 meets; the arguments are fields of `Features`."""
+    closest_hit, _ = make_intersector(triangles, spheres)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def inspect_hit(
+        geometry: Geometry,
+        paths: Paths,
+        # out
+        hit: wp.array[Hit],
+    ):
+        hit[0] = closest_hit(geometry, paths.origin[0], paths.direction[0])
+
+    return inspect_hit
+
+
+@functools.cache
+def make_inspect_light(lights: tuple[str, ...], light_textures: tuple[str, ...]):
+    """Kernel that draws the light sample of slot 0 as the direct-light stage does, with the same random numbers.
+
+    The arguments are fields of `Features`. The index of the light is -1 where that stage draws none, on a surface that
+    only reflects or refracts like a mirror.
+    """
+    sample_light, _ = make_light_sampler(lights, light_textures)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def inspect_light(
+        geometry: Geometry,
+        materials: MaterialTables,
+        textures: TextureTables,
+        lights: LightTables,
+        paths: Paths,
+        surfaces: Surfaces,
+        seed: wp.uint64,
+        counters: wp.array[wp.int32],
+        # out
+        index: wp.array[wp.int32],
+        sample: wp.array[LightSample],
+    ):
+        index[0] = -1
+        cos_o = -wp.dot(surfaces.shading_normal[0], paths.direction[0])
+        if is_smooth(materials.materials[surfaces.material[0]], cos_o):
+            u = uniform4(seed, paths.pixel[0], paths.sample[0], counters[DEPTH], PURPOSE_LIGHT)
+            index[0] = select_light(lights, u[0])
+            sample[0] = sample_light(lights, geometry, textures, surfaces.position[0], u)
+
+    return inspect_light
