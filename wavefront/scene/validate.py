@@ -15,7 +15,7 @@ from wavefront.scene.lookup import BSDF_FIELDS, NUMBER_FIELDS, TEXTURE_FIELDS, s
 from wavefront.scene.transforms import to_matrix
 
 MESH_SUFFIXES = (".ply", ".obj", ".gltf", ".glb")
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".hdr")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff", ".exr", ".hdr")
 _REFLECTING = ("diffuse", "oren_nayar", "conductor", "rough_conductor", "plastic", "rough_plastic")
 _LARGEST = float(np.finfo(np.float32).max)
 
