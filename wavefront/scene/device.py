@@ -9,12 +9,14 @@ import warp as wp
 
 from wavefront.accel.mesh_query import Geometry, Shape
 from wavefront.bsdf import tables as bsdf_tables
+from wavefront.errors import SceneError
 from wavefront.film import LUMINANCE
 from wavefront.light.tables import EmitterRecord, LightTables
 from wavefront.scene import description
 from wavefront.scene.light_upload import LightUpload
+from wavefront.scene.lookup import shown
 from wavefront.scene.material_upload import MaterialUpload
-from wavefront.scene.meshes import clear_cache, tessellate
+from wavefront.scene.meshes import LARGEST_COORDINATE, SMALLEST_TRIANGLE, clear_cache, tessellate
 from wavefront.scene.texture_upload import TextureAtlas, struct_array
 from wavefront.scene.transforms import to_matrix
 from wavefront.texture import TextureTables
@@ -94,6 +96,7 @@ class _Upload:
         meshes, spheres = [], []
         for i, shape in enumerate(self.scene.shapes):
             where = f"shapes[{i}]"
+            named = where + (f" ({shown(shape.name)})" if shape.name else "")
             emitter = self._emitter(shape.emitter, where) if shape.emitter is not None else -1
             record = {"material": self.materials.add(shape.bsdf, f"{where}.bsdf"), "first_light": -1}
             record["index"] = i
@@ -102,12 +105,20 @@ class _Upload:
                 matrix = to_matrix(shape.to_world, f"{where}.to_world")
                 center = matrix[:3, :3] @ np.asarray(shape.center) + matrix[:3, 3]
                 scale = abs(np.linalg.det(matrix[:3, :3])) ** (1.0 / 3.0)
+                reach = np.abs(center).max() + shape.radius * scale
+                if reach > LARGEST_COORDINATE or shape.radius * scale < SMALLEST_TRIANGLE:
+                    found = f"radius {shape.radius * scale:g} m, reaches {reach:g} m"
+                    limits = f"a radius of at least {SMALLEST_TRIANGLE:g} m within {LARGEST_COORDINATE:g} m"
+                    raise SceneError(f"a sphere that 32-bit rays cannot hit ({found}); allowed: {limits}", path=where)
                 record["flip"] = int(shape.flip_normals)
                 spheres.append((record, center, shape.radius * scale, emitter, matrix[:3, :3] / scale))
             else:
                 mesh = tessellate(shape, where)
-                if mesh.dropped:
-                    self.notes.append(f"{where}: {mesh.dropped} triangles without area are left out")
+                self.notes += [f"{named}: {note}" for note in mesh.notes]
+                textured = record["material"] in self.materials.textured
+                textured |= emitter >= 0 and self.emitters[emitter]["radiance_texture"] >= 0
+                if textured and mesh.uvs is None:
+                    self.notes.append(f"{named} has no UVs: its textures are looked up at (0, 0)")
                 record["smooth"] = int(mesh.normals is not None)
                 meshes.append((record, mesh, emitter))
         clear_cache()
