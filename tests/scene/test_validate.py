@@ -16,7 +16,7 @@ from wavefront.scene.validate import MESH_SUFFIXES, validate
 STEP = d.TransformStep
 TILES = str(Path(__file__).parents[2] / "scenes" / "textures" / "tiles.png")
 STEPS = "translate, rotate, scale, look_at, matrix"
-REFLECTING = "diffuse, oren_nayar, conductor, rough_conductor, plastic, rough_plastic"
+REFLECTING = "diffuse, oren_nayar, conductor, rough_conductor, plastic, rough_plastic, principled"
 TOO_LARGE = "expected a number of at most 3.403e+38, as 32-bit floats are; found"
 
 

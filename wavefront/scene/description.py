@@ -212,6 +212,44 @@ class ThinDielectric(Record, tag_field="type", tag="thin_dielectric"):
     specular_transmittance: Reflectance = 1.0
 
 
+class Principled(Record, tag_field="type", tag="principled"):
+    """The Disney model as Mitsuba 3 parameterises it: metal, coloured glass, paint, cloth and lacquer in one BSDF.
+
+    Burley 2012, "Physically Based Shading at Disney", and 2015, "Extending the Disney BRDF to a BSDF with Integrated
+    Subsurface Scattering". One-sided unless it transmits; the normal then points to the exterior.
+    """
+
+    name: str = ""
+    base_color: Reflectance = 0.5
+    roughness: Annotated[Opacity, Meta(description="Square root of the GGX alpha of the main specular lobe.")] = 0.5
+    anisotropic: Annotated[Opacity, Meta(description="Stretches the main specular lobe along the tangent.")] = 0.0
+    metallic: Annotated[Opacity, Meta(description="0: dielectric; 1: metal that reflects base_color.")] = 0.0
+    spec_trans: Annotated[
+        Opacity, Meta(description="Share of the dielectric that refracts in place of the diffuse base: 1 is glass.")
+    ] = 0.0
+    eta: Annotated[
+        Positive | None, Meta(description="Interior over exterior index of refraction; excludes specular.")
+    ] = None
+    specular: Annotated[
+        Fraction | None, Meta(description="12.5 times the reflectance at normal incidence; default, without eta: 0.5.")
+    ] = None
+    spec_tint: Annotated[Opacity, Meta(description="Tints the dielectric reflection towards base_color.")] = 0.0
+    sheen: Annotated[Opacity, Meta(description="Strength of the grazing lobe of cloth.")] = 0.0
+    sheen_tint: Annotated[Opacity, Meta(description="Tints the sheen towards base_color.")] = 0.0
+    flatness: Annotated[
+        Opacity, Meta(description="From diffuse reflection to an approximation of subsurface scattering.")
+    ] = 0.0
+    clearcoat: Annotated[Opacity, Meta(description="Strength of a second, isotropic specular lobe.")] = 0.0
+    clearcoat_gloss: Annotated[Opacity, Meta(description="0: a soft clearcoat; 1: a sharp one.")] = 0.0
+    main_specular_sampling_rate: Annotated[
+        Positive, Meta(description="Weight of the main specular lobe in sampling.")
+    ] = 1.0
+    clearcoat_sampling_rate: Annotated[NonNegative, Meta(description="Weight of the clearcoat in sampling.")] = 1.0
+    diffuse_reflectance_sampling_rate: Annotated[
+        NonNegative, Meta(description="Weight of the diffuse lobe in sampling.")
+    ] = 1.0
+
+
 class Null(Record, tag_field="type", tag="null"):
     """A surface that is not there: light passes. It can still emit."""
 
@@ -244,6 +282,7 @@ Bsdf = (
     | ThinDielectric
     | Plastic
     | RoughPlastic
+    | Principled
     | Null
     | TwoSided
     | Mask

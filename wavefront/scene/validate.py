@@ -16,7 +16,7 @@ from wavefront.scene.transforms import to_matrix
 
 MESH_SUFFIXES = (".ply", ".obj", ".gltf", ".glb")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".hdr")
-_REFLECTING = ("diffuse", "oren_nayar", "conductor", "rough_conductor", "plastic", "rough_plastic")
+_REFLECTING = ("diffuse", "oren_nayar", "conductor", "rough_conductor", "plastic", "rough_plastic", "principled")
 _LARGEST = float(np.finfo(np.float32).max)
 
 
@@ -41,6 +41,8 @@ def validate(
                 _check_conductor(record, path)
             elif hasattr(record, "int_ior"):
                 _check_dielectric(record, path)
+            elif isinstance(record, description.Principled):
+                _check_principled(record, path)
             elif isinstance(record, description.Mesh):
                 _check_mesh(record, path)
             elif isinstance(record, (description.TwoSided, description.Mask)):
@@ -127,6 +129,11 @@ def _check_dielectric(bsdf, path):
             _fail(f"{path}.{field}", unknown_name("index of refraction", ior, INDEX_OF_REFRACTION))
 
 
+def _check_principled(bsdf, path):
+    if bsdf.eta is not None and bsdf.specular is not None:
+        _fail(path, "a principled BSDF has eta or specular; found both")
+
+
 def _check_nesting(bsdf, path, bsdfs):
     """A two-sided BSDF holds reflecting ones; a mask holds anything but a mask. So nesting ends by itself."""
     for field in ("front", "back") if isinstance(bsdf, description.TwoSided) else ("bsdf",):
@@ -139,6 +146,8 @@ def _check_nesting(bsdf, path, bsdfs):
         kind = inner.__struct_config__.tag
         if isinstance(bsdf, description.TwoSided) and kind not in _REFLECTING:
             _fail(f"{path}.{field}", f"a twosided BSDF cannot hold {kind}; allowed: {', '.join(_REFLECTING)}")
+        if isinstance(bsdf, description.TwoSided) and kind == "principled" and inner.spec_trans != 0.0:
+            _fail(f"{path}.{field}", "a twosided BSDF cannot hold a principled one that transmits; spec_trans must be 0")
         if isinstance(bsdf, description.Mask) and kind == "mask":
             _fail(f"{path}.{field}", "a mask cannot hold another mask; multiply their opacities")
 
