@@ -147,7 +147,7 @@ def _check_nesting(bsdf, path, bsdfs):
         if isinstance(bsdf, description.TwoSided) and kind not in _REFLECTING:
             _fail(f"{path}.{field}", f"a twosided BSDF cannot hold {kind}; allowed: {', '.join(_REFLECTING)}")
         if isinstance(bsdf, description.TwoSided) and kind == "principled" and inner.spec_trans != 0.0:
-            _fail(f"{path}.{field}", "a twosided BSDF cannot hold a principled one that transmits; spec_trans must be 0")
+            _fail(f"{path}.{field}", "a principled BSDF that transmits is on both sides already; spec_trans must be 0")
         if isinstance(bsdf, description.Mask) and kind == "mask":
             _fail(f"{path}.{field}", "a mask cannot hold another mask; multiply their opacities")
 
