@@ -38,7 +38,7 @@ class Features:
     @property
     def transmission(self) -> bool:
         """Whether a path can cross into another medium, so that radiance scales with the index of refraction."""
-        return "dielectric" in self.bsdfs or "rough_dielectric" in self.bsdfs
+        return any(kind in self.bsdfs for kind in ("dielectric", "rough_dielectric", "principled_transmissive"))
 
     @property
     def smooth_bsdfs(self) -> bool:

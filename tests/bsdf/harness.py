@@ -25,6 +25,7 @@ from wavefront.bsdf.microfacet import (
 from wavefront.bsdf.null import sample_null
 from wavefront.bsdf.oren_nayar import eval_oren_nayar, sample_oren_nayar
 from wavefront.bsdf.plastic import eval_plastic, sample_plastic
+from wavefront.bsdf.principled import PrincipledParameters, make_principled
 from wavefront.bsdf.record import BsdfEval, BsdfSample
 from wavefront.bsdf.rough_conductor import eval_rough_conductor, sample_rough_conductor
 from wavefront.bsdf.rough_dielectric import eval_rough_dielectric, sample_rough_dielectric
@@ -53,6 +54,11 @@ class Parameters:
     internal: float
     nonlinear: int
     table: wp.array[wp.float32]
+    principled: PrincipledParameters
+
+
+eval_principled, sample_principled = make_principled(True)
+eval_opaque, sample_opaque = make_principled(False)
 
 
 @wp.func
@@ -139,6 +145,26 @@ def call_eval_rough_dielectric(p: Parameters, wo: wp.vec3, wi: wp.vec3):
     return eval_rough_dielectric(p.ior, p.reflectance, p.transmittance, p.alpha, p.distribution, wo, wi)
 
 
+@wp.func
+def call_sample_principled(p: Parameters, wo: wp.vec3, u: wp.vec3):
+    return sample_principled(p.principled, wo, u)
+
+
+@wp.func
+def call_sample_opaque(p: Parameters, wo: wp.vec3, u: wp.vec3):
+    return sample_opaque(p.principled, wo, u)
+
+
+@wp.func
+def call_eval_principled(p: Parameters, wo: wp.vec3, wi: wp.vec3):
+    return eval_principled(p.principled, wo, wi)
+
+
+@wp.func
+def call_eval_opaque(p: Parameters, wo: wp.vec3, wi: wp.vec3):
+    return eval_opaque(p.principled, wo, wi)
+
+
 def _sample_kernel(function):
     @wp.kernel(enable_backward=False, module="unique")
     def sample_kernel(
@@ -180,6 +206,8 @@ _SAMPLE_KERNELS = {
     "oren_nayar": _sample_kernel(call_sample_oren_nayar),
     "plastic": _sample_kernel(call_sample_plastic),
     "rough_plastic": _sample_kernel(call_sample_rough_plastic),
+    "principled": _sample_kernel(call_sample_opaque),
+    "principled_transmissive": _sample_kernel(call_sample_principled),
 }
 _EVAL_KERNELS = {
     "diffuse": _eval_kernel(call_eval_diffuse),
@@ -188,6 +216,8 @@ _EVAL_KERNELS = {
     "oren_nayar": _eval_kernel(call_eval_oren_nayar),
     "plastic": _eval_kernel(call_eval_plastic),
     "rough_plastic": _eval_kernel(call_eval_rough_plastic),
+    "principled": _eval_kernel(call_eval_opaque),
+    "principled_transmissive": _eval_kernel(call_eval_principled),
 }
 
 
@@ -237,6 +267,13 @@ def _fresnel_kernel(
     conductor[i] = fresnel_conductor(cos_i[i], eta, k)
 
 
+PRINCIPLED = {
+    "base_color": (0.5, 0.5, 0.5), "roughness": 0.5, "anisotropic": 0.0, "metallic": 0.0, "spec_trans": 0.0,
+    "eta": 1.5, "spec_tint": 0.0, "sheen": 0.0, "sheen_tint": 0.0, "flatness": 0.0, "clearcoat": 0.0,
+    "clearcoat_gloss": 0.0, "specular_rate": 1.0, "clearcoat_rate": 1.0, "diffuse_rate": 1.0,
+}  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Sample:
     wi: np.ndarray
@@ -262,8 +299,12 @@ def parameters(
     diffuse=(1.0, 1.0, 1.0),
     nonlinear=False,
     coating="smooth",
+    principled=None,
 ) -> Parameters:
-    """White by default: a perfect mirror, or a boundary that absorbs nothing."""
+    """White by default: a perfect mirror, or a boundary that absorbs nothing.
+
+    `principled` holds fields of `PrincipledParameters`, as Mitsuba's defaults where they are not given.
+    """
     p = Parameters()
     p.reflectance = wp.vec3(*reflectance)
     p.transmittance = wp.vec3(*transmittance)
@@ -275,6 +316,8 @@ def parameters(
     p.diffuse = wp.vec3(*diffuse)
     p.nonlinear = int(nonlinear)
     p.internal = diffuse_fresnel(1.0 / float(ior))
+    for name, value in (PRINCIPLED | (principled or {})).items():
+        setattr(p.principled, name, wp.vec3(*value) if name == "base_color" else float(value))
     if coating == "rough":
         table, p.internal = rough_coating(float(ior), float(alpha), int(distribution))
         p.table = wp.array(table, dtype=wp.float32, device=DEVICE)

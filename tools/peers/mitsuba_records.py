@@ -164,6 +164,8 @@ class _Writer:
             return result
         if isinstance(bsdf, description.OrenNayar):
             raise WavefrontError("Mitsuba 3 has no oren_nayar BSDF")
+        if isinstance(bsdf, description.Principled):
+            return self._principled(bsdf)
         if isinstance(bsdf, description.Null):
             return {"type": "null"}
         rough = isinstance(bsdf, (description.RoughConductor, description.RoughDielectric))
@@ -183,6 +185,14 @@ class _Writer:
             "ext_ior": bsdf.ext_ior,
             "specular_transmittance": self._parameter(bsdf.specular_transmittance),
         }
+
+    def _principled(self, bsdf):
+        result = {"type": "principled", "base_color": self._parameter(bsdf.base_color)}
+        for name in bsdf.__struct_fields__:
+            value = getattr(bsdf, name)
+            if name not in ("name", "base_color") and value is not None:
+                result[name] = self._parameter(value, scalar=True)
+        return result
 
     def _parameter(self, value, scalar=False):
         value = resolve_texture(self.scene, value)

@@ -13,6 +13,7 @@ from wavefront.bsdf.tables import (
     KIND_DIELECTRIC,
     KIND_NONE,
     KIND_NULL,
+    KIND_PRINCIPLED_TRANSMISSIVE,
     KIND_ROUGH_DIELECTRIC,
     KIND_THIN_DIELECTRIC,
     Material,
@@ -29,7 +30,7 @@ def is_delta_transmission(kind: int) -> bool:
 
 @wp.func
 def transmits(kind: int) -> bool:
-    return is_delta_transmission(kind) or kind == KIND_ROUGH_DIELECTRIC
+    return is_delta_transmission(kind) or kind == KIND_ROUGH_DIELECTRIC or kind == KIND_PRINCIPLED_TRANSMISSIVE
 
 
 @wp.func

@@ -8,6 +8,19 @@ from collections.abc import Iterable, Iterator
 from wavefront.errors import SceneError
 from wavefront.scene import description
 
+# Fields of a principled BSDF that are numbers from 0 to 1, or textures.
+PRINCIPLED_FRACTIONS = (
+    "roughness",
+    "anisotropic",
+    "metallic",
+    "spec_trans",
+    "spec_tint",
+    "sheen",
+    "sheen_tint",
+    "flatness",
+    "clearcoat",
+    "clearcoat_gloss",
+)
 # Fields in which a string is the name of a texture.
 TEXTURE_FIELDS = frozenset(
     (
@@ -16,17 +29,8 @@ TEXTURE_FIELDS = frozenset(
         "specular_reflectance",
         "specular_transmittance",
         "alpha",
-        "roughness",
         "base_color",
-        "anisotropic",
-        "metallic",
-        "spec_trans",
-        "spec_tint",
-        "sheen",
-        "sheen_tint",
-        "flatness",
-        "clearcoat",
-        "clearcoat_gloss",
+        *PRINCIPLED_FRACTIONS,
         "opacity",
         "radiance",
         "eta",

@@ -9,7 +9,7 @@ from wavefront.bsdf import tables as bsdf_tables
 from wavefront.bsdf.coating import diffuse_fresnel, rough_coating
 from wavefront.scene import description
 from wavefront.scene.ior import CONDUCTORS, INDEX_OF_REFRACTION
-from wavefront.scene.lookup import resolve_bsdf
+from wavefront.scene.lookup import PRINCIPLED_FRACTIONS, resolve_bsdf
 from wavefront.scene.texture_upload import TextureAtlas, struct_array
 
 DISTRIBUTIONS = {"ggx": 0, "beckmann": 1}
@@ -24,7 +24,26 @@ BSDF_KINDS = {
     description.Null: "null",
     description.Plastic: "plastic",
     description.RoughPlastic: "rough_plastic",
+    description.Principled: "principled",
 }
+
+
+def bsdf_kind(bsdf: description.Bsdf) -> str:
+    """Name of the kind, from `tables.KINDS`, of a BSDF that is neither two-sided nor a mask."""
+    if isinstance(bsdf, description.Principled) and bsdf.spec_trans != 0.0:  # a number, or textured
+        return "principled_transmissive"
+    return BSDF_KINDS[type(bsdf)]
+
+
+def _principled_eta(bsdf: description.Principled) -> float:
+    """Relative index of refraction; one that would not refract is moved off 1 as in Mitsuba 3 where light passes."""
+    transmits = bsdf_kind(bsdf) == "principled_transmissive"
+    if bsdf.eta is not None:
+        return 1.001 if transmits and bsdf.eta == 1.0 else bsdf.eta
+    specular = 0.5 if bsdf.specular is None else bsdf.specular
+    if transmits and specular == 0.0:
+        specular = 1e-3
+    return 2.0 / (1.0 - np.sqrt(0.08 * specular)) - 1.0
 
 
 def _relative_ior(bsdf) -> float:
@@ -51,6 +70,7 @@ class MaterialUpload:
             "dielectric": [],
             "plastic": [],
             "oren_nayar": [],
+            "principled": [],
         }
         self.coatings: list[np.ndarray] = []
         self.kinds: set[str] = set()
@@ -67,6 +87,7 @@ class MaterialUpload:
         materials.dielectric = struct_array(bsdf_tables.DielectricRecord, self.bsdfs["dielectric"], device)
         materials.plastic = struct_array(bsdf_tables.PlasticRecord, self.bsdfs["plastic"], device)
         materials.oren_nayar = struct_array(bsdf_tables.OrenNayarRecord, self.bsdfs["oren_nayar"], device)
+        materials.principled = struct_array(bsdf_tables.PrincipledRecord, self.bsdfs["principled"], device)
         coatings = np.concatenate([np.zeros(0), *self.coatings])
         materials.coatings = wp.array(coatings, dtype=wp.float32, device=device)
         return materials
@@ -92,7 +113,7 @@ class MaterialUpload:
             sides.append(sides[0] if back is front else self._bsdf(back, f"{where}.back"))
         else:
             front = self._bsdf(inner, where)
-            transmits = BSDF_KINDS[type(inner)] in bsdf_tables.TRANSMISSIVE
+            transmits = bsdf_kind(inner) in bsdf_tables.TRANSMISSIVE
             sides = [front, front if transmits else (int(bsdf_tables.KIND_NONE), 0)]
         (material["front"], material["front_index"]), (material["back"], material["back_index"]) = sides
         self.materials.append(material)
@@ -102,7 +123,7 @@ class MaterialUpload:
 
     def _bsdf(self, bsdf: description.Bsdf, where: str) -> tuple[int, int]:
         """Kind and record index of a BSDF that is neither two-sided nor a mask."""
-        kind = BSDF_KINDS[type(bsdf)]
+        kind = bsdf_kind(bsdf)
         self.kinds.add(kind)
         if kind == "null":
             return bsdf_tables.KINDS[kind], 0  # has no parameters, hence no record
@@ -136,6 +157,15 @@ class MaterialUpload:
                 )
                 record["first"] = sum(part.size for part in self.coatings)
                 self.coatings.append(transmittance)
+        elif isinstance(bsdf, description.Principled):
+            table = "principled"
+            record["eta"] = _principled_eta(bsdf)
+            record["specular_rate"] = bsdf.main_specular_sampling_rate
+            record["clearcoat_rate"] = bsdf.clearcoat_sampling_rate
+            record["diffuse_rate"] = bsdf.diffuse_reflectance_sampling_rate
+            self._set(record, "base_color", bsdf.base_color, f"{where}.base_color")
+            for name in PRINCIPLED_FRACTIONS:
+                self._set(record, name, getattr(bsdf, name), f"{where}.{name}", scalar=True)
         else:
             table = "dielectric"
             record["eta"] = _relative_ior(bsdf)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from wavefront.errors import SceneError
 from wavefront.scene import description
+from wavefront.scene.lookup import PRINCIPLED_FRACTIONS
 from wavefront.scene.mitsuba_values import Element, to_number, to_numbers
 from wavefront.scene.mitsuba_xml import Document, Plugin
 
@@ -45,6 +46,7 @@ class Materials:
             "thindielectric": self._dielectric,
             "plastic": self._plastic,
             "roughplastic": self._plastic,
+            "principled": self._principled,
             "twosided": self._twosided,
             "mask": self._mask,
             "null": self._null,
@@ -171,6 +173,28 @@ class Materials:
         if "alpha" in fields and _is_smooth(fields["alpha"]):
             del fields["alpha"], fields["distribution"]
         return (description.RoughPlastic if "alpha" in fields else description.Plastic)(**fields)
+
+    def _principled(self, plugin):
+        fields = {"base_color": self.colour(plugin, "base_color", 0.5, limit=1.0)}
+        for name in PRINCIPLED_FRACTIONS:
+            fields[name] = self.scalar(plugin, name, getattr(description.Principled(), name), limit=1.0)
+        if plugin.has("eta") and plugin.has("specular"):
+            raise plugin.error(f"{plugin.label()} has either eta or specular")
+        for name, allowed, is_allowed in (
+            ("eta", "greater than 0", lambda value: value > 0.0),
+            ("specular", "from 0 to 1", lambda value: 0.0 <= value <= 1.0),
+            ("main_specular_sampling_rate", "greater than 0", lambda value: value > 0.0),
+            ("clearcoat_sampling_rate", "at least 0", lambda value: value >= 0.0),
+            ("diffuse_reflectance_sampling_rate", "at least 0", lambda value: value >= 0.0),
+        ):
+            if plugin.child(name) is not None:
+                raise plugin.error(f"{name} of {plugin.label()} must be a number, not a texture")
+            if plugin.has(name):
+                value = fields[name] = plugin.number(name)
+                if not is_allowed(value):
+                    raise plugin.get(name).error(f"{name} must be {allowed}; found {value:g}")
+        plugin.finish("texture")
+        return description.Principled(**fields)
 
     def _ior(self, plugin, name, default):
         element = plugin.get(name)
