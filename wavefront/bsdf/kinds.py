@@ -56,6 +56,22 @@ def make_eval_scalar(textures: tuple[str, ...]):
 
 
 @functools.cache
+def make_eval_alpha(textures: tuple[str, ...]):
+    """`eval_alpha(tables, value, texture_u, texture_v, uv) -> vec2`: roughness along the tangent and across it."""
+    eval_scalar = make_eval_scalar(textures)
+
+    @wp.func
+    def eval_alpha(textures: TextureTables, value: wp.vec2, texture_u: int, texture_v: int, uv: wp.vec2) -> wp.vec2:
+        u = clamp_alpha(eval_scalar(textures, value[0], texture_u, uv))
+        v = u
+        if value[1] != value[0] or texture_v != texture_u:
+            v = clamp_alpha(eval_scalar(textures, value[1], texture_v, uv))
+        return wp.vec2(u, v)
+
+    return eval_alpha
+
+
+@functools.cache
 def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
     """BSDFs in their local frame, by kind and index of the record.
 
@@ -80,6 +96,7 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
     has_oren_nayar = "oren_nayar" in kinds
     eval_parameter = make_eval_parameter(textures)
     eval_scalar = make_eval_scalar(textures)
+    eval_alpha = make_eval_alpha(textures)
 
     @wp.func
     def eval_local(
@@ -106,7 +123,7 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
                     eval_parameter(textures, c.eta, c.eta_texture, uv),
                     eval_parameter(textures, c.k, c.k_texture, uv),
                     eval_parameter(textures, c.reflectance, c.reflectance_texture, uv),
-                    clamp_alpha(eval_scalar(textures, c.alpha, c.alpha_texture, uv)),
+                    eval_alpha(textures, c.alpha, c.alpha_u_texture, c.alpha_v_texture, uv),
                     c.distribution,
                     wo,
                     wi,
@@ -118,7 +135,7 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
                     g.eta,
                     eval_parameter(textures, g.reflectance, g.reflectance_texture, uv),
                     eval_parameter(textures, g.transmittance, g.transmittance_texture, uv),
-                    clamp_alpha(eval_scalar(textures, g.alpha, g.alpha_texture, uv)),
+                    eval_alpha(textures, g.alpha, g.alpha_u_texture, g.alpha_v_texture, uv),
                     g.distribution,
                     wo,
                     wi,
@@ -144,7 +161,7 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
                     p.eta,
                     p.internal_reflectance,
                     p.nonlinear,
-                    p.alpha,
+                    wp.vec2(p.alpha),
                     p.distribution,
                     tables.coatings,
                     p.first,
@@ -188,7 +205,7 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
                     eval_parameter(textures, c.eta, c.eta_texture, uv),
                     eval_parameter(textures, c.k, c.k_texture, uv),
                     eval_parameter(textures, c.reflectance, c.reflectance_texture, uv),
-                    clamp_alpha(eval_scalar(textures, c.alpha, c.alpha_texture, uv)),
+                    eval_alpha(textures, c.alpha, c.alpha_u_texture, c.alpha_v_texture, uv),
                     c.distribution,
                     wo,
                     u,
@@ -210,7 +227,7 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
                     g.eta,
                     eval_parameter(textures, g.reflectance, g.reflectance_texture, uv),
                     eval_parameter(textures, g.transmittance, g.transmittance_texture, uv),
-                    clamp_alpha(eval_scalar(textures, g.alpha, g.alpha_texture, uv)),
+                    eval_alpha(textures, g.alpha, g.alpha_u_texture, g.alpha_v_texture, uv),
                     g.distribution,
                     wo,
                     u,
@@ -236,7 +253,7 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
                     p.eta,
                     p.internal_reflectance,
                     p.nonlinear,
-                    p.alpha,
+                    wp.vec2(p.alpha),
                     p.distribution,
                     tables.coatings,
                     p.first,
