@@ -18,6 +18,7 @@ class Features:
     spheres: bool
     smooth: bool  # some mesh has vertex normals
     uvs: bool  # some texture is looked up
+    tangents: bool  # some BSDF depends on the direction of its tangent
 
     # Materials
     bsdfs: tuple[str, ...]  # kinds, sorted

@@ -48,7 +48,7 @@ class Parameters:
     eta: wp.vec3
     k: wp.vec3
     ior: float
-    alpha: float
+    alpha: wp.vec2
     distribution: int
     diffuse: wp.vec3
     internal: float
@@ -98,12 +98,12 @@ def call_sample_null(p: Parameters, wo: wp.vec3, u: wp.vec3):
 
 @wp.func
 def call_sample_oren_nayar(p: Parameters, wo: wp.vec3, u: wp.vec3):
-    return sample_oren_nayar(p.reflectance, p.alpha, wo, u)
+    return sample_oren_nayar(p.reflectance, p.alpha[0], wo, u)
 
 
 @wp.func
 def call_eval_oren_nayar(p: Parameters, wo: wp.vec3, wi: wp.vec3):
-    return eval_oren_nayar(p.reflectance, p.alpha, wo, wi)
+    return eval_oren_nayar(p.reflectance, p.alpha[0], wo, wi)
 
 
 @wp.func
@@ -225,7 +225,7 @@ _EVAL_KERNELS = {
 def _normals_kernel(
     wo: wp.array(dtype=wp.vec3),
     u: wp.array(dtype=wp.vec3),
-    alpha: float,
+    alpha: wp.vec2,
     distribution: int,
     # outputs
     m: wp.array(dtype=wp.vec3),
@@ -238,7 +238,7 @@ def _normals_kernel(
 def _terms_kernel(
     wo: wp.array(dtype=wp.vec3),
     m: wp.array(dtype=wp.vec3),
-    alpha: float,
+    alpha: wp.vec2,
     distribution: int,
     # outputs
     terms: wp.array(dtype=wp.vec3),
@@ -311,7 +311,7 @@ def parameters(
     p.eta = wp.vec3(*eta)
     p.k = wp.vec3(*k)
     p.ior = float(ior)
-    p.alpha = float(alpha)
+    p.alpha = pair(alpha)
     p.distribution = int(distribution)
     p.diffuse = wp.vec3(*diffuse)
     p.nonlinear = int(nonlinear)
@@ -353,19 +353,24 @@ def evaluate(name: str, p: Parameters, wo, wi) -> Eval:
     return Eval(e["value"], e["pdf"])
 
 
-def visible_normals(wo, alpha: float, distribution: int, u) -> np.ndarray:
+def pair(alpha) -> wp.vec2:
+    """Roughness along x and y, from one number or two."""
+    return wp.vec2(*np.broadcast_to(alpha, 2).astype(float))
+
+
+def visible_normals(wo, alpha, distribution: int, u) -> np.ndarray:
     n = len(u)
     m = wp.empty(n, dtype=wp.vec3, device=DEVICE)
-    inputs = [_in(vectors(wo, n)), _in(vectors(u, n)), alpha, distribution]
+    inputs = [_in(vectors(wo, n)), _in(vectors(u, n)), pair(alpha), distribution]
     wp.launch(_normals_kernel, dim=n, inputs=inputs, outputs=[m], device=DEVICE)
     return m.numpy()
 
 
-def microfacet_terms(wo, m, alpha: float, distribution: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def microfacet_terms(wo, m, alpha, distribution: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """D(m), G1(wo), and the density of the visible normal m."""
     n = max(len(np.atleast_2d(wo)), len(np.atleast_2d(m)))
     terms = wp.empty(n, dtype=wp.vec3, device=DEVICE)
-    inputs = [_in(vectors(wo, n)), _in(vectors(m, n)), alpha, distribution]
+    inputs = [_in(vectors(wo, n)), _in(vectors(m, n)), pair(alpha), distribution]
     wp.launch(_terms_kernel, dim=n, inputs=inputs, outputs=[terms], device=DEVICE)
     d, g1, pdf = terms.numpy().T
     return d, g1, pdf

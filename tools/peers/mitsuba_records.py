@@ -8,7 +8,7 @@ import numpy as np
 
 from wavefront.errors import WavefrontError
 from wavefront.scene import description
-from wavefront.scene.lookup import resolve_bsdf, resolve_texture
+from wavefront.scene.lookup import resolve_bsdf, resolve_texture, roughness
 from wavefront.scene.meshes import tessellate, write_ply
 from wavefront.scene.transforms import is_mirror, to_matrix
 
@@ -171,7 +171,9 @@ class _Writer:
         rough = isinstance(bsdf, (description.RoughConductor, description.RoughDielectric))
         result = {"specular_reflectance": self._parameter(bsdf.specular_reflectance)}
         if rough:
-            result |= {"distribution": bsdf.distribution, "alpha": self._parameter(bsdf.alpha, scalar=True)}
+            result["distribution"] = bsdf.distribution
+            for key, (_, value) in zip(("alpha_u", "alpha_v"), roughness(bsdf), strict=True):
+                result[key] = self._parameter(value, scalar=True)
         if isinstance(bsdf, (description.Conductor, description.RoughConductor)):
             result["type"] = "roughconductor" if rough else "conductor"
             if bsdf.material is not None:

@@ -60,6 +60,22 @@ def make_eval_scalar(textures: tuple[str, ...]):
 
 
 @functools.cache
+def make_eval_alpha(textures: tuple[str, ...]):
+    """`eval_alpha(tables, value, texture_u, texture_v, uv) -> vec2`: roughness along the tangent and across it."""
+    eval_scalar = make_eval_scalar(textures)
+
+    @wp.func
+    def eval_alpha(textures: TextureTables, value: wp.vec2, texture_u: int, texture_v: int, uv: wp.vec2) -> wp.vec2:
+        u = clamp_alpha(eval_scalar(textures, value[0], texture_u, uv))
+        v = u
+        if value[1] != value[0] or texture_v != texture_u:
+            v = clamp_alpha(eval_scalar(textures, value[1], texture_v, uv))
+        return wp.vec2(u, v)
+
+    return eval_alpha
+
+
+@functools.cache
 def make_principled_at(textures: tuple[str, ...]):
     """`principled_at(record, tables, uv) -> PrincipledParameters`: what a principled material is at one point."""
     eval_parameter = make_eval_parameter(textures)
@@ -119,6 +135,7 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
     has_principled = "principled" in kinds or has_transmissive
     eval_parameter = make_eval_parameter(textures)
     eval_scalar = make_eval_scalar(textures)
+    eval_alpha = make_eval_alpha(textures)
     principled_at = make_principled_at(textures)
     # One pair of functions for both kinds: what transmits includes what does not.
     eval_principled, sample_principled = make_principled(has_transmissive)
@@ -148,7 +165,7 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
                     eval_parameter(textures, c.eta, c.eta_texture, uv),
                     eval_parameter(textures, c.k, c.k_texture, uv),
                     eval_parameter(textures, c.reflectance, c.reflectance_texture, uv),
-                    clamp_alpha(eval_scalar(textures, c.alpha, c.alpha_texture, uv)),
+                    eval_alpha(textures, c.alpha, c.alpha_u_texture, c.alpha_v_texture, uv),
                     c.distribution,
                     wo,
                     wi,
@@ -160,7 +177,7 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
                     g.eta,
                     eval_parameter(textures, g.reflectance, g.reflectance_texture, uv),
                     eval_parameter(textures, g.transmittance, g.transmittance_texture, uv),
-                    clamp_alpha(eval_scalar(textures, g.alpha, g.alpha_texture, uv)),
+                    eval_alpha(textures, g.alpha, g.alpha_u_texture, g.alpha_v_texture, uv),
                     g.distribution,
                     wo,
                     wi,
@@ -186,7 +203,7 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
                     p.eta,
                     p.internal_reflectance,
                     p.nonlinear,
-                    p.alpha,
+                    wp.vec2(p.alpha),
                     p.distribution,
                     tables.coatings,
                     p.first,
@@ -233,7 +250,7 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
                     eval_parameter(textures, c.eta, c.eta_texture, uv),
                     eval_parameter(textures, c.k, c.k_texture, uv),
                     eval_parameter(textures, c.reflectance, c.reflectance_texture, uv),
-                    clamp_alpha(eval_scalar(textures, c.alpha, c.alpha_texture, uv)),
+                    eval_alpha(textures, c.alpha, c.alpha_u_texture, c.alpha_v_texture, uv),
                     c.distribution,
                     wo,
                     u,
@@ -255,7 +272,7 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
                     g.eta,
                     eval_parameter(textures, g.reflectance, g.reflectance_texture, uv),
                     eval_parameter(textures, g.transmittance, g.transmittance_texture, uv),
-                    clamp_alpha(eval_scalar(textures, g.alpha, g.alpha_texture, uv)),
+                    eval_alpha(textures, g.alpha, g.alpha_u_texture, g.alpha_v_texture, uv),
                     g.distribution,
                     wo,
                     u,
@@ -281,7 +298,7 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
                     p.eta,
                     p.internal_reflectance,
                     p.nonlinear,
-                    p.alpha,
+                    wp.vec2(p.alpha),
                     p.distribution,
                     tables.coatings,
                     p.first,

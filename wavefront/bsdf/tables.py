@@ -73,8 +73,9 @@ class ConductorRecord:
     k_texture: wp.int32
     reflectance: wp.vec3
     reflectance_texture: wp.int32
-    alpha: wp.float32
-    alpha_texture: wp.int32
+    alpha: wp.vec2  # along the tangent and across it
+    alpha_u_texture: wp.int32
+    alpha_v_texture: wp.int32
     distribution: wp.int32
 
 
@@ -87,8 +88,9 @@ class DielectricRecord:
     reflectance_texture: wp.int32
     transmittance: wp.vec3
     transmittance_texture: wp.int32
-    alpha: wp.float32
-    alpha_texture: wp.int32
+    alpha: wp.vec2  # along the tangent and across it
+    alpha_u_texture: wp.int32
+    alpha_v_texture: wp.int32
     distribution: wp.int32
 
 

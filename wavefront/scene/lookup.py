@@ -29,6 +29,8 @@ TEXTURE_FIELDS = frozenset(
         "specular_reflectance",
         "specular_transmittance",
         "alpha",
+        "alpha_u",
+        "alpha_v",
         "base_color",
         *PRINCIPLED_FRACTIONS,
         "opacity",
@@ -82,6 +84,13 @@ def resolve_texture(scene: description.Scene, ref: object) -> object:
         SceneError: No texture of the scene has that name.
     """
     return _resolve("texture", scene.textures, ref)
+
+
+def roughness(bsdf: description.RoughConductor | description.RoughDielectric) -> tuple[tuple[str, object], ...]:
+    """Field and value of the roughness along the tangent, and the same across it."""
+    if bsdf.alpha_u is not None:
+        return ("alpha_u", bsdf.alpha_u), ("alpha_v", bsdf.alpha_v)
+    return (("alpha", 0.1 if bsdf.alpha is None else bsdf.alpha),) * 2
 
 
 def _resolve(kind, records, ref):

@@ -9,7 +9,7 @@ from wavefront.bsdf import tables as bsdf_tables
 from wavefront.bsdf.coating import diffuse_fresnel, rough_coating
 from wavefront.scene import description
 from wavefront.scene.ior import CONDUCTORS, INDEX_OF_REFRACTION
-from wavefront.scene.lookup import PRINCIPLED_FRACTIONS, resolve_bsdf
+from wavefront.scene.lookup import PRINCIPLED_FRACTIONS, resolve_bsdf, roughness
 from wavefront.scene.texture_upload import TextureAtlas, struct_array
 
 DISTRIBUTIONS = {"ggx": 0, "beckmann": 1}
@@ -76,6 +76,7 @@ class MaterialUpload:
         self.kinds: set[str] = set()
         self.known: dict[int, int] = {}
         self.mask = False
+        self.tangents = False  # whether some BSDF depends on the direction of its tangent
         self.keep_alive: list = []
 
     def upload(self, device: str) -> bsdf_tables.MaterialTables:
@@ -94,6 +95,14 @@ class MaterialUpload:
 
     def _set(self, record: dict, name: str, value, where: str, scalar: bool = False):
         record[name], record[f"{name}_texture"] = self.atlas.parameter(self.scene, value, where, scalar)
+
+    def _set_alpha(self, record: dict, bsdf, where: str):
+        values = [
+            self.atlas.parameter(self.scene, value, f"{where}.{name}", scalar=True) for name, value in roughness(bsdf)
+        ]
+        record["alpha"] = [value for value, _ in values]
+        record["alpha_u_texture"], record["alpha_v_texture"] = (texture for _, texture in values)
+        self.tangents |= values[0] != values[1]
 
     def add(self, ref, where: str) -> int:
         """Index of the material of a BSDF record; the same record is stored once."""
@@ -164,6 +173,7 @@ class MaterialUpload:
             record["clearcoat_rate"] = bsdf.clearcoat_sampling_rate
             record["diffuse_rate"] = bsdf.diffuse_reflectance_sampling_rate
             self._set(record, "base_color", bsdf.base_color, f"{where}.base_color")
+            self.tangents |= bsdf.anisotropic != 0.0
             for name in PRINCIPLED_FRACTIONS:
                 self._set(record, name, getattr(bsdf, name), f"{where}.{name}", scalar=True)
         else:
@@ -172,7 +182,7 @@ class MaterialUpload:
             self._set(record, "reflectance", bsdf.specular_reflectance, f"{where}.specular_reflectance")
             self._set(record, "transmittance", bsdf.specular_transmittance, f"{where}.specular_transmittance")
         if kind in ("rough_conductor", "rough_dielectric"):
-            self._set(record, "alpha", bsdf.alpha, f"{where}.alpha", scalar=True)
+            self._set_alpha(record, bsdf, where)
             record["distribution"] = DISTRIBUTIONS[bsdf.distribution]
         self.bsdfs[table].append(record)
         return bsdf_tables.KINDS[kind], len(self.bsdfs[table]) - 1

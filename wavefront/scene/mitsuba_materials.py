@@ -119,9 +119,7 @@ class Materials:
         if plugin.type == "roughconductor":
             fields |= self._roughness(plugin)
         plugin.finish("texture")
-        if "alpha" in fields and _is_smooth(fields["alpha"]):
-            del fields["alpha"], fields["distribution"]
-        return (description.RoughConductor if "alpha" in fields else description.Conductor)(**fields)
+        return (description.RoughConductor if "distribution" in fields else description.Conductor)(**fields)
 
     def _conductor_spectrum(self, plugin):
         material = plugin.string("material", "")
@@ -153,11 +151,9 @@ class Materials:
         if plugin.type == "roughdielectric":
             fields |= self._roughness(plugin)
         plugin.finish("texture")
-        if "alpha" in fields and _is_smooth(fields["alpha"]):
-            del fields["alpha"], fields["distribution"]
         if plugin.type == "thindielectric":
             return description.ThinDielectric(**fields)
-        return (description.RoughDielectric if "alpha" in fields else description.Dielectric)(**fields)
+        return (description.RoughDielectric if "distribution" in fields else description.Dielectric)(**fields)
 
     def _plastic(self, plugin):
         fields = {"nonlinear": plugin.boolean("nonlinear")}
@@ -170,9 +166,7 @@ class Materials:
                 raise plugin.error(f"{plugin.label()} needs one number alpha for both directions")
             fields |= self._roughness(plugin)
         plugin.finish("texture")
-        if "alpha" in fields and _is_smooth(fields["alpha"]):
-            del fields["alpha"], fields["distribution"]
-        return (description.RoughPlastic if "alpha" in fields else description.Plastic)(**fields)
+        return (description.RoughPlastic if "distribution" in fields else description.Plastic)(**fields)
 
     def _principled(self, plugin):
         fields = {"base_color": self.colour(plugin, "base_color", 0.5, limit=1.0)}
@@ -220,15 +214,21 @@ class Materials:
         if directions:
             if plugin.has("alpha"):
                 raise plugin.error("alpha excludes alpha_u and alpha_v")
-            first, second = (self.scalar(plugin, name, 0.1) for name in ("alpha_u", "alpha_v"))
-            if first != second:
-                raise plugin.error("anisotropic roughness is not supported; alpha_u and alpha_v must be equal")
-            alpha = first
+            fields = {name: self.scalar(plugin, name, 0.1) for name in ("alpha_u", "alpha_v")}
+            if fields["alpha_u"] == fields["alpha_v"]:
+                fields = {"alpha": fields["alpha_u"]}
         else:
-            alpha = self.scalar(plugin, "alpha", 0.1)
-        if isinstance(alpha, float) and alpha > 1.0:
-            raise plugin.error(f"alpha must be at most 1; found {alpha:g}")
-        return {"alpha": alpha, "distribution": distribution}
+            fields = {"alpha": self.scalar(plugin, "alpha", 0.1)}
+        for name, value in fields.items():
+            if isinstance(value, float) and value > 1.0:
+                raise plugin.error(f"{name} must be at most 1; found {value:g}")
+        if all(_is_smooth(value) for value in fields.values()):
+            return {}
+        if any(_is_smooth(value) for value in fields.values()):
+            raise plugin.error(f"alpha_u and alpha_v must both be below {SMOOTHEST:g}, or neither")
+        if fields.get("alpha") == 0.1:
+            del fields["alpha"]  # the default
+        return fields | {"distribution": distribution}
 
     def _twosided(self, plugin):
         sides = plugin.objects("bsdf")
