@@ -18,7 +18,7 @@ SPHERE = {"type": "sphere"}
 NAME_OR_BITMAP = "a list of 3 numbers >= 0 and <= 1, a name or an object of type 'bitmap' or 'checkerboard'"
 BSDF_TYPES = (
     "'diffuse', 'oren_nayar', 'conductor', 'rough_conductor', 'dielectric', 'rough_dielectric', 'thin_dielectric', "
-    "'plastic', 'rough_plastic', 'null', 'twosided'"
+    "'plastic', 'rough_plastic', 'principled', 'null', 'twosided'"
 )
 
 

@@ -133,14 +133,21 @@ class Conductor(Record, tag_field="type", tag="conductor"):
 
 
 class RoughConductor(Record, tag_field="type", tag="rough_conductor"):
-    """Conductor with a microfacet surface, isotropic."""
+    """Conductor with a microfacet surface."""
 
     name: str = ""
     material: Annotated[str | None, Meta(description="Named metal; excludes eta and k.")] = None
     eta: Spectrum | None = None
     k: Spectrum | None = None
     specular_reflectance: Reflectance = 1.0
-    alpha: Annotated[Alpha, Meta(description="Microfacet roughness (root mean square slope for Beckmann).")] = 0.1
+    alpha: Annotated[
+        Alpha | None,
+        Meta(description="Microfacet roughness (root mean square slope for Beckmann); default: 0.1."),
+    ] = None
+    alpha_u: Annotated[Alpha | None, Meta(description="Roughness along growing u; with alpha_v instead of alpha.")] = (
+        None
+    )
+    alpha_v: Annotated[Alpha | None, Meta(description="Roughness across it; with alpha_u instead of alpha.")] = None
     distribution: Distribution = "ggx"
 
 
@@ -160,7 +167,7 @@ class Dielectric(Record, tag_field="type", tag="dielectric"):
 
 
 class RoughDielectric(Record, tag_field="type", tag="rough_dielectric"):
-    """Boundary between two dielectrics with a microfacet surface, isotropic."""
+    """Boundary between two dielectrics with a microfacet surface."""
 
     name: str = ""
     int_ior: Annotated[
@@ -169,7 +176,14 @@ class RoughDielectric(Record, tag_field="type", tag="rough_dielectric"):
     ext_ior: Annotated[IOR, Meta(description="Exterior index of refraction, or a name.")] = 1.000277
     specular_reflectance: Reflectance = 1.0
     specular_transmittance: Reflectance = 1.0
-    alpha: Annotated[Alpha, Meta(description="Microfacet roughness (root mean square slope for Beckmann).")] = 0.1
+    alpha: Annotated[
+        Alpha | None,
+        Meta(description="Microfacet roughness (root mean square slope for Beckmann); default: 0.1."),
+    ] = None
+    alpha_u: Annotated[Alpha | None, Meta(description="Roughness along growing u; with alpha_v instead of alpha.")] = (
+        None
+    )
+    alpha_v: Annotated[Alpha | None, Meta(description="Roughness across it; with alpha_u instead of alpha.")] = None
     distribution: Distribution = "ggx"
 
 
@@ -213,6 +227,44 @@ class ThinDielectric(Record, tag_field="type", tag="thin_dielectric"):
     specular_transmittance: Reflectance = 1.0
 
 
+class Principled(Record, tag_field="type", tag="principled"):
+    """The Disney model as Mitsuba 3 parameterises it: metal, coloured glass, paint, cloth and lacquer in one BSDF.
+
+    Burley 2012, "Physically Based Shading at Disney", and 2015, "Extending the Disney BRDF to a BSDF with Integrated
+    Subsurface Scattering". One-sided unless it transmits; the normal then points to the exterior.
+    """
+
+    name: str = ""
+    base_color: Reflectance = 0.5
+    roughness: Annotated[Opacity, Meta(description="Square root of the GGX alpha of the main specular lobe.")] = 0.5
+    anisotropic: Annotated[Opacity, Meta(description="Stretches the main specular lobe along the tangent.")] = 0.0
+    metallic: Annotated[Opacity, Meta(description="0: dielectric; 1: metal that reflects base_color.")] = 0.0
+    spec_trans: Annotated[
+        Opacity, Meta(description="Share of the dielectric that refracts in place of the diffuse base: 1 is glass.")
+    ] = 0.0
+    eta: Annotated[
+        Positive | None, Meta(description="Interior over exterior index of refraction; excludes specular.")
+    ] = None
+    specular: Annotated[
+        Fraction | None, Meta(description="12.5 times the reflectance at normal incidence; default, without eta: 0.5.")
+    ] = None
+    spec_tint: Annotated[Opacity, Meta(description="Tints the dielectric reflection towards base_color.")] = 0.0
+    sheen: Annotated[Opacity, Meta(description="Strength of the grazing lobe of cloth.")] = 0.0
+    sheen_tint: Annotated[Opacity, Meta(description="Tints the sheen towards base_color.")] = 0.0
+    flatness: Annotated[
+        Opacity, Meta(description="From diffuse reflection to an approximation of subsurface scattering.")
+    ] = 0.0
+    clearcoat: Annotated[Opacity, Meta(description="Strength of a second, isotropic specular lobe.")] = 0.0
+    clearcoat_gloss: Annotated[Opacity, Meta(description="0: a soft clearcoat; 1: a sharp one.")] = 0.0
+    main_specular_sampling_rate: Annotated[
+        Positive, Meta(description="Weight of the main specular lobe in sampling.")
+    ] = 1.0
+    clearcoat_sampling_rate: Annotated[NonNegative, Meta(description="Weight of the clearcoat in sampling.")] = 1.0
+    diffuse_reflectance_sampling_rate: Annotated[
+        NonNegative, Meta(description="Weight of the diffuse lobe in sampling.")
+    ] = 1.0
+
+
 class Null(Record, tag_field="type", tag="null"):
     """A surface that is not there: light passes. It can still emit."""
 
@@ -245,6 +297,7 @@ Bsdf = (
     | ThinDielectric
     | Plastic
     | RoughPlastic
+    | Principled
     | Null
     | TwoSided
     | Mask

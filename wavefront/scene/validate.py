@@ -17,7 +17,7 @@ from wavefront.scene.transforms import to_matrix
 
 MESH_SUFFIXES = (".ply", ".obj", ".gltf", ".glb")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff", ".exr", ".hdr")
-_REFLECTING = ("diffuse", "oren_nayar", "conductor", "rough_conductor", "plastic", "rough_plastic")
+_REFLECTING = ("diffuse", "oren_nayar", "conductor", "rough_conductor", "plastic", "rough_plastic", "principled")
 _LARGEST = float(np.finfo(np.float32).max)
 
 
@@ -36,12 +36,16 @@ def validate(
         for path, record in walk(scene):
             _check_numbers(record, path)
             _check_references(record, path, bsdfs, textures)
+            if hasattr(record, "alpha_u"):
+                _check_roughness(record, path)
             if isinstance(record, (description.Bitmap, description.Envmap)):
                 _check_file(record.file, IMAGE_SUFFIXES, "image", f"{path}.file")
             elif isinstance(record, (description.Conductor, description.RoughConductor)):
                 _check_conductor(record, path)
             elif hasattr(record, "int_ior"):
                 _check_dielectric(record, path)
+            elif isinstance(record, description.Principled):
+                _check_principled(record, path)
             elif isinstance(record, description.Mesh):
                 _check_mesh(record, path)
             elif isinstance(record, (description.TwoSided, description.Mask)):
@@ -124,11 +128,22 @@ def _check_conductor(bsdf, path):
         _fail(f"{path}.material", unknown_name("metal", bsdf.material, CONDUCTORS))
 
 
+def _check_roughness(bsdf, path):
+    given = [name for name in ("alpha", "alpha_u", "alpha_v") if getattr(bsdf, name) is not None]
+    if given not in ([], ["alpha"], ["alpha_u", "alpha_v"]):
+        _fail(path, f"a rough surface has alpha, or alpha_u and alpha_v; found {' and '.join(given)}")
+
+
 def _check_dielectric(bsdf, path):
     for field in ("int_ior", "ext_ior"):
         ior = getattr(bsdf, field)
         if isinstance(ior, str) and ior not in INDEX_OF_REFRACTION:
             _fail(f"{path}.{field}", unknown_name("index of refraction", ior, INDEX_OF_REFRACTION))
+
+
+def _check_principled(bsdf, path):
+    if bsdf.eta is not None and bsdf.specular is not None:
+        _fail(path, "a principled BSDF has eta or specular; found both")
 
 
 def _check_nesting(bsdf, path, bsdfs):
@@ -143,6 +158,8 @@ def _check_nesting(bsdf, path, bsdfs):
         kind = inner.__struct_config__.tag
         if isinstance(bsdf, description.TwoSided) and kind not in _REFLECTING:
             _fail(f"{path}.{field}", f"a twosided BSDF cannot hold {kind}; allowed: {', '.join(_REFLECTING)}")
+        if isinstance(bsdf, description.TwoSided) and kind == "principled" and inner.spec_trans != 0.0:
+            _fail(f"{path}.{field}", "a principled BSDF that transmits is on both sides already; spec_trans must be 0")
         if isinstance(bsdf, description.Mask) and kind == "mask":
             _fail(f"{path}.{field}", "a mask cannot hold another mask; multiply their opacities")
 

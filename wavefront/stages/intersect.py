@@ -17,6 +17,7 @@ def make_intersect(
     spheres: bool,
     smooth: bool,
     uvs: bool,
+    tangents: bool,
     area_lights: bool,
     escape_lights: bool,
     shape_index: bool = False,
@@ -26,7 +27,7 @@ def make_intersect(
     `shape_index`: whether the index of the shape is an AOV.
     """
     closest_hit, _ = make_intersector(triangles, spheres)
-    vertex_of = make_vertex(triangles, spheres, smooth, uvs)
+    vertex_of = make_vertex(triangles, spheres, smooth, uvs, tangents)
 
     @wp.kernel(enable_backward=False, module="unique")
     def closest_hits(
@@ -62,6 +63,8 @@ def make_intersect(
         surfaces.material[slot] = shape.material
         if wp.static(uvs):
             surfaces.uv[slot] = vertex.uv
+        if wp.static(tangents):
+            surfaces.tangent[slot] = vertex.tangent
         if wp.static(shape_index):
             surfaces.shape[slot] = shape.index
         if wp.static(area_lights):
