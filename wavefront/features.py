@@ -22,6 +22,7 @@ class Features:
     # Materials
     bsdfs: tuple[str, ...]  # kinds, sorted
     mask: bool  # some material is not opaque
+    media: bool  # some medium absorbs
     textures: tuple[str, ...]  # kinds, sorted
 
     # Lights

@@ -191,8 +191,9 @@ def render(
     rr_depth: int | None = None,
     threads: int | None = None,
     sensor: int = 0,
+    integrator: str = "path",
 ) -> np.ndarray:
-    """Renders with Mitsuba's `path`: next-event estimation, independent sampler.
+    """Renders with Mitsuba: next-event estimation, independent sampler.
 
     Args:
         scene: From `load_xml` or `load_records`.
@@ -202,6 +203,7 @@ def render(
         rr_depth: Depth from which Russian roulette may end a path; None: never.
         threads: As in `use_variant`.
         sensor: Index of the sensor.
+        integrator: ``path``, which ignores media, or ``volpath``.
 
     Returns:
         Mean radiance, [height, width, 3] float64. Mitsuba itself adds samples up in float32.
@@ -217,7 +219,7 @@ def render(
     if threads is not None:
         set_threads(threads)
     rr_depth = NEVER if rr_depth is None else rr_depth
-    integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": rr_depth})
+    plugin = mi.load_dict({"type": integrator, "max_depth": max_depth, "rr_depth": rr_depth})
     camera = scene.sensors()[sensor]
     pixels = int(np.prod(np.array(camera.film().crop_size())))
     largest = max(1, PATHS_PER_PASS // pixels)
@@ -227,7 +229,7 @@ def render(
     total, done = 0.0, 0
     for i in range(passes):
         samples = (spp * (i + 1)) // passes - done
-        image = mi.render(scene, sensor=camera, integrator=integrator, spp=samples, seed=(seed << 12) + i)
+        image = mi.render(scene, sensor=camera, integrator=plugin, spp=samples, seed=(seed << 12) + i)
         total = total + samples * np.array(image, np.float64)[..., :3]
         done += samples
     return total / spp

@@ -8,7 +8,7 @@ import numpy as np
 
 from wavefront.errors import WavefrontError
 from wavefront.scene import description
-from wavefront.scene.lookup import resolve_bsdf, resolve_texture
+from wavefront.scene.lookup import resolve_bsdf, resolve_medium, resolve_texture, walk
 from wavefront.scene.meshes import tessellate, write_ply
 from wavefront.scene.transforms import is_mirror, to_matrix
 
@@ -32,6 +32,11 @@ def from_records(scene: description.Scene, folder: str | Path) -> dict:
     return _Writer(scene, Path(folder)).scene_dict()
 
 
+def integrator_of(scene: description.Scene) -> str:
+    """The integrator of Mitsuba that renders the scene as ours does: `path` leaves media out, `volpath` is slower."""
+    return "volpath" if any(isinstance(record, description.Homogeneous) for _, record in walk(scene)) else "path"
+
+
 class _Writer:
     def __init__(self, scene: description.Scene, folder: Path):
         import mitsuba  # only here: a peer that need not be installed
@@ -43,7 +48,7 @@ class _Writer:
         result = {
             "type": "scene",
             "integrator": {
-                "type": "path",
+                "type": integrator_of(self.scene),
                 "max_depth": integrator.max_depth,
                 "rr_depth": NEVER if integrator.rr_depth is None else integrator.rr_depth,
             },
@@ -60,7 +65,7 @@ class _Writer:
         kind = type(film.filter).__struct_config__.tag
         rfilter = {"type": kind}
         rfilter |= {name: getattr(film.filter, name) for name in film.filter.__struct_fields__}
-        return {
+        return self._media(medium=camera.medium) | {
             "type": "perspective",
             "fov": camera.fov,
             "fov_axis": camera.fov_axis,
@@ -118,7 +123,7 @@ class _Writer:
 
     def _shape(self, index, shape):
         where = f"shapes[{index}]"
-        result = {"bsdf": self._bsdf(shape.bsdf)}
+        result = {"bsdf": self._bsdf(shape.bsdf)} | self._media(interior=shape.interior, exterior=shape.exterior)
         if shape.emitter is not None:
             if shape.emitter.two_sided:
                 raise WavefrontError(f"{where}: Mitsuba has no emission from both sides")
@@ -137,6 +142,16 @@ class _Writer:
         else:
             result["type"] = type(shape).__struct_config__.tag
         return result | {"to_world": self._transform(matrix), "flip_normals": flip}
+
+    def _media(self, **references):
+        """Those that are given. Mitsuba takes a medium that is given twice as two, which changes nothing."""
+        result = {}
+        for name, reference in references.items():
+            medium = resolve_medium(self.scene, reference)
+            if medium is not None:
+                sigma_t = {"type": "rgb", "value": [float(value) for value in np.broadcast_to(medium.sigma_a, 3)]}
+                result[name] = {"type": "homogeneous", "sigma_t": sigma_t, "albedo": 0.0, "scale": medium.scale}
+        return result
 
     # --- materials -----------------------------------------------------------------------------------------------
 

@@ -6,13 +6,22 @@ import functools
 
 import warp as wp
 
-from wavefront.accel.mesh_query import Geometry, make_intersector
+from wavefront.accel.mesh_query import INFINITE, Geometry, make_intersector
+from wavefront.medium import transmittance
 from wavefront.queues import DEPTH, Paths, Queue, Surfaces, push, queue_size
 from wavefront.surface import make_vertex
 
 
 @functools.cache
-def make_intersect(triangles: bool, spheres: bool, smooth: bool, uvs: bool, area_lights: bool, escape_lights: bool):
+def make_intersect(
+    triangles: bool,
+    spheres: bool,
+    smooth: bool,
+    uvs: bool,
+    area_lights: bool,
+    escape_lights: bool,
+    media: bool = False,
+):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name (or whether there are any)."""
     closest_hit, _ = make_intersector(triangles, spheres)
     vertex_of = make_vertex(triangles, spheres, smooth, uvs)
@@ -20,7 +29,7 @@ def make_intersect(triangles: bool, spheres: bool, smooth: bool, uvs: bool, area
     @wp.kernel(enable_backward=False, module="unique")
     def closest_hits(
         geometry: Geometry,
-        paths: Paths,
+        paths: Paths,  # also out, where a medium absorbs
         rays: Queue,
         max_depth: int,
         # out
@@ -37,8 +46,19 @@ def make_intersect(triangles: bool, spheres: bool, smooth: bool, uvs: bool, area
         origin = paths.origin[slot]
         direction = paths.direction[slot]
         hit = closest_hit(geometry, origin, direction)
+        if wp.static(media):
+            medium = geometry.camera_medium
+            start = origin
+            if counters[DEPTH] > 0:
+                medium = paths.medium[slot]
+                start = surfaces.position[
+                    slot
+                ]  # the last vertex: the ray starts off it, as far as a sheet may be thick
+            sigma_a = geometry.sigma_a[medium]
         if hit.primitive < 0:
             surfaces.material[slot] = -1
+            if wp.static(media):
+                paths.beta[slot] = wp.cw_mul(paths.beta[slot], transmittance(sigma_a, INFINITE))
             if wp.static(escape_lights):
                 push(escaped, slot, counters)
             return
@@ -51,6 +71,11 @@ def make_intersect(triangles: bool, spheres: bool, smooth: bool, uvs: bool, area
         surfaces.material[slot] = shape.material
         if wp.static(uvs):
             surfaces.uv[slot] = vertex.uv
+        if wp.static(media):
+            sides = wp.vec2i(shape.exterior, shape.interior)
+            surfaces.media[slot] = wp.where(shape.exterior < 0, wp.vec2i(medium, medium), sides)
+            distance = wp.length(vertex.position - start)
+            paths.beta[slot] = wp.cw_mul(paths.beta[slot], transmittance(sigma_a, distance))
         if wp.static(area_lights):
             light = int(-1)
             front = wp.dot(vertex.geometric_normal, direction) < 0.0
