@@ -149,8 +149,14 @@ class _Writer:
         for name, reference in references.items():
             medium = resolve_medium(self.scene, reference)
             if medium is not None:
-                sigma_t = {"type": "rgb", "value": [float(value) for value in np.broadcast_to(medium.sigma_a, 3)]}
-                result[name] = {"type": "homogeneous", "sigma_t": sigma_t, "albedo": 0.0, "scale": medium.scale}
+                sigma_a = medium.scale * np.broadcast_to(medium.sigma_a, 3)
+                scale = float(sigma_a.max()) or 1.0  # Mitsuba takes colours up to 1
+                result[name] = {
+                    "type": "homogeneous",
+                    "sigma_t": _colour(sigma_a / scale),
+                    "albedo": 0.0,
+                    "scale": scale,
+                }
         return result
 
     # --- materials -----------------------------------------------------------------------------------------------
