@@ -48,6 +48,17 @@ class Settings:
     seed: wp.uint64
 
 
+@wp.func
+def absorbed(sigma_a: wp.array[wp.vec3], medium: int, distance: float) -> wp.vec3:
+    """What a medium leaves of light; the table is empty where the scene has none."""
+    left = wp.vec3(1.0)
+    if sigma_a.shape[0] > 0:
+        for k in range(3):
+            if sigma_a[medium][k] > 0.0:
+                left[k] = wp.where(distance < INFINITE, wp.exp(-sigma_a[medium][k] * distance), 0.0)
+    return left
+
+
 @functools.cache
 def make_megakernel(
     camera_kind: str, triangles: bool, spheres: bool, smooth: bool, uvs: bool, tangents: bool, nee: bool
@@ -93,10 +104,13 @@ def make_megakernel(
         L = wp.vec3(0.0)
         beta = wp.vec3(1.0)
         bsdf_pdf = float(0.0)
-        medium = float(1.0)  # index of refraction relative to the camera's
+        eta = float(1.0)  # index of refraction relative to the camera's
+        inside = geometry.camera_medium
+        left = origin  # where the segment begins, without the offset of its ray
         for segment in range(1, settings.max_depth + 1):
             hit = closest_hit(geometry, origin, direction)
             if hit.primitive < 0:
+                beta = wp.cw_mul(beta, absorbed(geometry.sigma_a, inside, INFINITE))
                 if lights.environment >= 0:
                     sky = lights.lights[lights.environment]
                     Le = wp.vec3(0.0)
@@ -126,6 +140,7 @@ def make_megakernel(
                 break
             vertex = vertex_of(geometry, origin, direction, hit)
             shape = geometry.shapes[geometry.shape_of[hit.primitive]]
+            beta = wp.cw_mul(beta, absorbed(geometry.sigma_a, inside, wp.length(vertex.position - left)))
             emits = wp.dot(vertex.geometric_normal, direction) < 0.0 or shape.two_sided == 1
             if shape.first_light >= 0 and emits:
                 index = shape.first_light + hit.primitive - shape.first_primitive
@@ -139,6 +154,11 @@ def make_megakernel(
                 L += w * wp.cw_mul(beta, Le)
             if segment == settings.max_depth:
                 break
+            front = inside
+            back = inside
+            if shape.exterior >= 0:
+                front = shape.exterior
+                back = shape.interior
 
             wo = -direction
             frame = ShadingFrame()
@@ -155,27 +175,34 @@ def make_megakernel(
                         to_light = light.wi
                         if light.t_max < INFINITE:
                             to_light = light.target - start
+                        through = wp.where(wp.dot(light.wi, vertex.geometric_normal) < 0.0, back, front)
+                        distance = float(INFINITE)
+                        if light.t_max < INFINITE:
+                            distance = wp.length(light.target - vertex.position)
+                        Ld = wp.cw_mul(light.L, absorbed(geometry.sigma_a, through, distance))
                         if not occluded(geometry, start, to_light, light.t_max):
                             ratio = f.pdf / light.pdf
                             w = 1.0 / (1.0 + ratio * ratio)
                             if light.delta == 1:
                                 w = 1.0
-                            L += (w / light.pdf) * wp.cw_mul(beta, wp.cw_mul(f.value, light.L))
+                            L += (w / light.pdf) * wp.cw_mul(beta, wp.cw_mul(f.value, Ld))
 
             u = uniform4(seed, key, sample, segment - 1, PURPOSE_BSDF)
             s = sample_bsdf(materials, textures, shape.material, vertex.uv, frame, wo, wp.vec3(u[0], u[1], u[2]))
             beta = wp.cw_mul(beta, s.weight)
             if not wp.max(beta) > 0.0:
                 break
-            medium *= s.eta
+            eta *= s.eta
             if segment >= settings.rr_depth:
-                q = wp.min(0.95, wp.max(beta) * medium * medium)
+                q = wp.min(0.95, wp.max(beta) * eta * eta)
                 if u[3] >= q:
                     break
                 beta = beta / q
             direction = wp.normalize(s.wi)
             origin = spawn_origin(vertex.position, vertex.geometric_normal, vertex.offset, direction)
+            left = vertex.position
             bsdf_pdf = s.pdf
+            inside = wp.where(wp.dot(direction, vertex.geometric_normal) < 0.0, back, front)
         result[i] = L
 
     return trace_paths

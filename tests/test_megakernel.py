@@ -68,6 +68,7 @@ DEFAULT = [
     "material-diffuse-bitmap",
     "material-twosided",
     "principled-lobes",
+    "coloured-glass",
 ]
 OTHERS = sorted(p.stem for p in SCENES.glob("*.json") if p.stem not in [*DEFAULT, "cornell-box"])
 
@@ -183,3 +184,16 @@ def test_scene_without_lights_is_black():
     renderer = Renderer(scene, threads=1)
     assert (renderer.render(2) == 0.0).all()
     assert (render_megakernel(renderer, 2) == 0.0).all()
+
+
+@pytest.mark.parametrize("nee", [True, False])
+def test_media(nee):
+    """Everything in a haze, which a glass ball and a mask displace: what a path and a shadow ray travel in."""
+    scene = mixed_scene()
+    haze = d.Homogeneous(name="haze", sigma_a=[0.05, 0.02, 0.0])
+    scene.media, scene.camera.medium = [haze], "haze"
+    for i, shape in enumerate(scene.shapes):
+        if i % 2 == 1:
+            shape.exterior, shape.interior = "haze", d.Homogeneous(sigma_a=[0.3, 0.9, 0.1], scale=0.5 + i)
+    scene.integrator.nee = nee
+    check(scene, spp=8)

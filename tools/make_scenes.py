@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from tools import door_scene, light_scenes
+from tools import door_scene, glass_scenes, light_scenes
 from tools.scene_parts import box, film, look_at, place, rectangle, revolve, write_ply
 from wavefront.scene import json_format
 from wavefront.scene.description import (
@@ -71,6 +71,7 @@ def write(folder: Path) -> list[str]:
         "furnace.json": furnace(),
         "glossy-plates.json": glossy_plates(),
         "glass-caustic.json": glass_caustic(),
+        "coloured-glass.json": glass_scenes.coloured_glass(),
         "door-ajar.json": door_scene.door_ajar(folder),
         "principled-lobes.json": principled_lobes(folder),
         "include/material-stage.json": material_stage(),

@@ -23,6 +23,7 @@ class Features:
     # Materials
     bsdfs: tuple[str, ...]  # kinds, sorted
     mask: bool  # some material is not opaque
+    media: bool  # some medium absorbs
     textures: tuple[str, ...]  # kinds, sorted
 
     # Lights

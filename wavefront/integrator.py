@@ -53,6 +53,7 @@ def make_features(scene: description.Scene, device_scene: DeviceScene) -> Featur
         tangents=device_scene.tangents,
         bsdfs=device_scene.bsdfs,
         mask=device_scene.mask,
+        media=device_scene.media,
         textures=device_scene.texture_kinds,
         lights=device_scene.light_kinds,
         light_textures=device_scene.light_texture_kinds,
@@ -99,16 +100,17 @@ def make_kernels(f: Features) -> Kernels:
             f.area_lights,
             bool(f.escape_lights),
             "shape_index" in f.aovs,
+            f.media,
         ),
         escaped=make_escaped(f.escape_lights, f.light_sampling) if f.escape_lights else None,
         emission=make_emission(f.lights, f.light_textures, f.light_sampling) if f.area_lights else None,
         aov=make_aov(f.aovs, f.bsdfs, f.mask, f.textures, f.uvs, f.tangents) if f.aovs else None,
-        direct=make_direct(f.bsdfs, f.mask, f.textures, f.lights, f.light_textures, f.uvs, f.tangents)
+        direct=make_direct(f.bsdfs, f.mask, f.textures, f.lights, f.light_textures, f.uvs, f.tangents, f.media)
         if f.light_sampling
         else None,
         shadow=make_shadow(f.triangles, f.spheres) if f.light_sampling else None,
         drain=drain_rays,
-        scatter=make_scatter(f.bsdfs, f.mask, f.textures, f.uvs, f.tangents, f.transmission, f.roulette),
+        scatter=make_scatter(f.bsdfs, f.mask, f.textures, f.uvs, f.tangents, f.transmission, f.roulette, f.media),
         advance=advance_bounce,
         accumulate=make_accumulate(f.variance),
     )
@@ -116,9 +118,15 @@ def make_kernels(f: Features) -> Kernels:
 
 def skipped_arrays(f: Features) -> dict[type, tuple[str, ...]]:
     """Arrays of the path state that the features do without."""
-    surface_arrays = {"uv": f.uvs, "tangent": f.tangents, "light": f.area_lights, "shape": "shape_index" in f.aovs}
+    surface_arrays = {
+        "uv": f.uvs,
+        "tangent": f.tangents,
+        "media": f.media,
+        "light": f.area_lights,
+        "shape": "shape_index" in f.aovs,
+    }
     return {
-        Paths: () if f.transmission else ("eta",),
+        Paths: (() if f.transmission else ("eta",)) + (() if f.media else ("medium",)),
         Surfaces: tuple(name for name, used in surface_arrays.items() if not used),
         ShadowRays: () if f.light_sampling else tuple(ShadowRays.vars),
     }

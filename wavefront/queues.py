@@ -77,6 +77,7 @@ class Paths:
     L: wp.array[wp.vec3]  # radiance collected so far
     pdf: wp.array[wp.float32]  # of `direction`, in solid angle; 0 for a delta lobe or the camera
     eta: wp.array[wp.float32]  # product of relative indices of refraction; allocated if something transmits
+    medium: wp.array[wp.int32]  # that the next ray travels in; allocated if a medium absorbs
     pixel: wp.array[wp.uint32]  # key of the random numbers, with the sample
     sample: wp.array[wp.uint32]
 
@@ -92,6 +93,7 @@ class Surfaces:
     # depends on it
     offset: wp.array[wp.float32]  # how far along the geometric normal a ray must start, in metres
     uv: wp.array[wp.vec2]  # allocated if a texture is looked up, or asked for as an AOV
+    media: wp.array[wp.vec2i]  # in front of the geometric normal and behind it; allocated if a medium absorbs
     material: wp.array[wp.int32]  # -1 where the ray escaped
     light: wp.array[wp.int32]  # -1 where the surface does not emit
     shape: wp.array[wp.int32]  # allocated if asked for as an AOV

@@ -114,7 +114,7 @@ ERRORS = [
     (to_world('<shear x="1"/>'), 3, "<shear> cannot stand inside a <transform>"),
     (to_world('<scale w="1"/>'), 3, "has no attribute 'w'"),
     (to_world('<lookat origin="1 1 1" target="1 1 1"/>'), 3, "same point"),
-    (on_shape('<medium type="homogeneous" name="interior"/>'), 2, "participating media are not supported"),
+    (on_shape('<medium type="homogeneous" name="interior"/>'), 2, "scatters: albedo is 0.75"),
     ("<translate x='1'/>", 2, "belongs inside a <transform>"),
     ("<luminaire/>", 2, "use <emitter>"),
     ("<shap/>", 2, "did you mean 'shape'?"),

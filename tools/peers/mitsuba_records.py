@@ -8,7 +8,7 @@ import numpy as np
 
 from wavefront.errors import WavefrontError
 from wavefront.scene import description
-from wavefront.scene.lookup import resolve_bsdf, resolve_texture, roughness
+from wavefront.scene.lookup import resolve_bsdf, resolve_medium, resolve_texture, roughness, walk
 from wavefront.scene.meshes import tessellate, write_ply
 from wavefront.scene.transforms import is_mirror, to_matrix
 
@@ -32,6 +32,11 @@ def from_records(scene: description.Scene, folder: str | Path) -> dict:
     return _Writer(scene, Path(folder)).scene_dict()
 
 
+def integrator_of(scene: description.Scene) -> str:
+    """The integrator of Mitsuba that renders the scene as ours does: `path` leaves media out, `volpath` is slower."""
+    return "volpath" if any(isinstance(record, description.Homogeneous) for _, record in walk(scene)) else "path"
+
+
 class _Writer:
     def __init__(self, scene: description.Scene, folder: Path):
         import mitsuba  # only here: a peer that need not be installed
@@ -43,7 +48,7 @@ class _Writer:
         result = {
             "type": "scene",
             "integrator": {
-                "type": "path",
+                "type": integrator_of(self.scene),
                 "max_depth": integrator.max_depth,
                 "rr_depth": NEVER if integrator.rr_depth is None else integrator.rr_depth,
             },
@@ -64,11 +69,12 @@ class _Writer:
         rfilter |= {name: getattr(film.filter, name) for name in film.filter.__struct_fields__}
         window = film.window
         frame = CAMERA_FRAME
+        result = self._media(medium=camera.medium)
         if isinstance(camera, description.Orthographic):
-            result = {"type": "orthographic"}
+            result |= {"type": "orthographic"}
             frame = CAMERA_FRAME @ np.diag([camera.width / 2.0, camera.width / 2.0, 1.0, 1.0])
         else:
-            result = {"type": "perspective", "fov": camera.fov, "fov_axis": camera.fov_axis}
+            result |= {"type": "perspective", "fov": camera.fov, "fov_axis": camera.fov_axis}
             x, y = camera.principal_point_offset
             if isinstance(camera, description.ThinLens):
                 if x or y:
@@ -136,7 +142,7 @@ class _Writer:
 
     def _shape(self, index, shape):
         where = f"shapes[{index}]"
-        result = {"bsdf": self._bsdf(shape.bsdf)}
+        result = {"bsdf": self._bsdf(shape.bsdf)} | self._media(interior=shape.interior, exterior=shape.exterior)
         if shape.emitter is not None:
             if shape.emitter.two_sided:
                 raise WavefrontError(f"{where}: Mitsuba has no emission from both sides")
@@ -155,6 +161,22 @@ class _Writer:
         else:
             result["type"] = type(shape).__struct_config__.tag
         return result | {"to_world": self._transform(matrix), "flip_normals": flip}
+
+    def _media(self, **references):
+        """Those that are given. Mitsuba takes a medium that is given twice as two, which changes nothing."""
+        result = {}
+        for name, reference in references.items():
+            medium = resolve_medium(self.scene, reference)
+            if medium is not None:
+                sigma_a = medium.scale * np.broadcast_to(medium.sigma_a, 3)
+                scale = float(sigma_a.max()) or 1.0  # Mitsuba takes colours up to 1
+                result[name] = {
+                    "type": "homogeneous",
+                    "sigma_t": _colour(sigma_a / scale),
+                    "albedo": 0.0,
+                    "scale": scale,
+                }
+        return result
 
     # --- materials -----------------------------------------------------------------------------------------------
 

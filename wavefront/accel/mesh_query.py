@@ -24,6 +24,8 @@ class Shape:
     flip: wp.int32  # 1: a sphere that faces inwards
     two_sided: wp.int32  # 1: the back emits too
     index: wp.int32  # place in the scene's list of shapes
+    exterior: wp.int32  # medium in front; -1: the shape bounds no medium
+    interior: wp.int32  # medium behind
 
 
 @wp.struct
@@ -39,6 +41,8 @@ class Geometry:
     sphere_to_local: wp.array[wp.mat33]  # world normals to the sphere's own axes; empty as `uvs`
     shape_of: wp.array[wp.int32]  # shape of each primitive
     shapes: wp.array[Shape]
+    sigma_a: wp.array[wp.vec3]  # of each medium, 1/m; the first is vacuum; empty if none absorbs
+    camera_medium: wp.int32
 
 
 @wp.struct

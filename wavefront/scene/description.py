@@ -385,6 +385,19 @@ class Sun(Record, tag_field="type", tag="sun"):
 
 Emitter = Constant | Envmap | Directional | Point | Spot | Sun
 
+# --- media -----------------------------------------------------------------------------------------------------
+
+
+class Homogeneous(Record, tag_field="type", tag="homogeneous"):
+    """What a part of space is filled with: the same everywhere, and absorbing without scattering."""
+
+    name: str = ""
+    sigma_a: Annotated[NonNegative | RGB, Meta(description="Absorption coefficient, 1/m.")] = 0.0
+    scale: Annotated[NonNegative, Meta(description="Multiplies the coefficient.")] = 1.0
+
+
+Medium = Homogeneous
+
 # --- shapes ----------------------------------------------------------------------------------------------------
 
 
@@ -396,6 +409,14 @@ class Shape(Record):
     emitter: Annotated[Area | None, Meta(description="Makes the shape an area light.")] = None
     to_world: Transform = []
     flip_normals: bool = False
+    interior: Annotated[
+        str | Medium | None,
+        Meta(
+            description="Name of a medium, or a medium, behind the surface: light that crosses it goes on in there. "
+            "A surface with one of interior and exterior has vacuum on its other side; with neither it bounds none."
+        ),
+    ] = None
+    exterior: Annotated[str | Medium | None, Meta(description="The medium in front of the surface.")] = None
 
 
 class Mesh(Shape, tag_field="type", tag="mesh"):
@@ -440,7 +461,16 @@ AnyShape = Mesh | Rectangle | Cube | Disk | Sphere
 # --- camera, film, integrator ------------------------------------------------------------------------------------
 
 
-class Perspective(Record, tag_field="type", tag="perspective"):
+class CameraRecord(Record):
+    """What all cameras share."""
+
+    to_world: Transform = []
+    medium: Annotated[
+        str | Medium | None, Meta(description="Name of a medium, or a medium, that the camera is in; default: vacuum.")
+    ] = None
+
+
+class Perspective(CameraRecord, tag_field="type", tag="perspective"):
     """Pinhole camera."""
 
     fov: Annotated[float, Meta(gt=0.0, lt=180.0, description="Field of view along fov_axis, degrees.")] = 40.0
@@ -448,7 +478,6 @@ class Perspective(Record, tag_field="type", tag="perspective"):
     principal_point_offset: Annotated[
         Vec2, Meta(description="Moves the image to the left and up, in fractions of the film's width and height.")
     ] = (0.0, 0.0)
-    to_world: Transform = []
 
 
 class ThinLens(Perspective, kw_only=True, tag_field="type", tag="thin_lens"):
@@ -462,11 +491,10 @@ class ThinLens(Perspective, kw_only=True, tag_field="type", tag="thin_lens"):
     ]
 
 
-class Orthographic(Record, tag_field="type", tag="orthographic"):
+class Orthographic(CameraRecord, tag_field="type", tag="orthographic"):
     """Camera of parallel rays, which start on its film at local z = 0."""
 
     width: Annotated[Positive, Meta(description="Width of the film in metres, before to_world.")] = 2.0
-    to_world: Transform = []
 
 
 Camera = Perspective | ThinLens | Orthographic
@@ -567,8 +595,10 @@ class Scene(Record):
     integrator: PathIntegrator = msgspec.field(default_factory=PathIntegrator)
     textures: Annotated[list[Texture], Meta(description="Named textures.")] = []
     bsdfs: Annotated[list[Bsdf], Meta(description="Named BSDFs.")] = []
+    media: Annotated[list[Medium], Meta(description="Named media.")] = []
     emitters: Annotated[list[Emitter], Meta(description="Emitters that are not shapes; at most one environment.")] = []
     include: Annotated[
-        list[str], Meta(description="Scene files whose textures, bsdfs, emitters and shapes are added to this one.")
+        list[str],
+        Meta(description="Scene files whose textures, bsdfs, media, emitters and shapes are added to this one."),
     ] = []
     description: Annotated[str, Meta(description="What the scene is for.")] = ""

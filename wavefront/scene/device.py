@@ -16,6 +16,7 @@ from wavefront.scene import description
 from wavefront.scene.light_upload import LightUpload
 from wavefront.scene.lookup import shown
 from wavefront.scene.material_upload import MaterialUpload
+from wavefront.scene.medium_upload import MediumUpload
 from wavefront.scene.meshes import LARGEST_COORDINATE, SMALLEST_TRIANGLE, clear_cache, tessellate
 from wavefront.scene.texture_upload import TextureAtlas, struct_array
 from wavefront.scene.transforms import to_matrix
@@ -38,6 +39,7 @@ class DeviceScene:
     bsdfs: tuple[str, ...]
     mask: bool
     tangents: bool
+    media: bool
     texture_kinds: tuple[str, ...]
     light_kinds: tuple[str, ...]
     light_texture_kinds: tuple[str, ...]
@@ -59,6 +61,7 @@ class _Upload:
         self.scene, self.device = scene, device
         self.atlas = TextureAtlas()
         self.materials = MaterialUpload(scene, self.atlas)
+        self.media = MediumUpload(scene)
         self.emitters: list[dict] = []
         self.light_texture_kinds: set[str] = set()
         self.keep_alive: list = []
@@ -72,6 +75,7 @@ class _Upload:
         lights, light_kinds = upload.run(meshes, spheres, bounds)
         lights.emitters = struct_array(EmitterRecord, self.emitters, self.device)
         geometry.shapes = struct_array(Shape, self.shape_records, self.device)
+        self.media.upload(geometry, self.device)
         return DeviceScene(
             geometry=geometry,
             materials=self.materials.upload(self.device),
@@ -84,6 +88,7 @@ class _Upload:
             bsdfs=tuple(sorted(self.materials.kinds)),
             mask=self.materials.mask,
             tangents=self.materials.tangents,
+            media=self.media.absorbing,
             texture_kinds=tuple(sorted(set(self.atlas.kinds))),
             light_kinds=light_kinds,
             light_texture_kinds=tuple(sorted(self.light_texture_kinds)),
@@ -103,6 +108,7 @@ class _Upload:
             record = {"material": self.materials.add(shape.bsdf, f"{where}.bsdf"), "first_light": -1}
             record["index"] = i
             record["two_sided"] = int(shape.emitter is not None and shape.emitter.two_sided)
+            record |= self.media.sides(shape)
             if isinstance(shape, description.Sphere):
                 matrix = to_matrix(shape.to_world, f"{where}.to_world")
                 center = matrix[:3, :3] @ np.asarray(shape.center) + matrix[:3, 3]

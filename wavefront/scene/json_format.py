@@ -19,7 +19,7 @@ from wavefront.scene.explain import explain, format_path, found
 from wavefront.scene.lookup import NUMBER_FIELDS, shown, walk
 from wavefront.scene.validate import validate
 
-INCLUDABLE = ("textures", "bsdfs", "emitters", "shapes")
+INCLUDABLE = ("textures", "bsdfs", "media", "emitters", "shapes")
 _INCLUDE_KEYS = (*INCLUDABLE, "description", "include")
 _OVERRIDE_STEP = re.compile(r"([A-Za-z_]\w*)((?:\[\d{1,9}\])*)")
 _LINE_LENGTH = 120
@@ -332,7 +332,7 @@ def dumps(scene: description.Scene, base_dir: str | os.PathLike) -> str:
     for key in ("camera", "film", "integrator"):
         if not raw[key] or raw[key] == defaults[key]:
             del raw[key]
-    order = ("description", "include", "camera", "film", "integrator", "textures", "bsdfs", "emitters", "shapes")
+    order = ("description", "include", "camera", "film", "integrator", *INCLUDABLE)
     try:
         return _write({key: raw[key] for key in order if key in raw}, "", 0) + "\n"
     except ValueError:

@@ -41,6 +41,8 @@ TEXTURE_FIELDS = frozenset(
 )
 # Fields in which a string is the name of a BSDF.
 BSDF_FIELDS = frozenset(("bsdf", "front", "back"))
+# Fields in which a string is the name of a medium.
+MEDIUM_FIELDS = frozenset(("interior", "exterior", "medium"))
 # Long lists of numbers, in which there is no record to find.
 NUMBER_FIELDS = frozenset(("vertices", "faces", "normals", "uvs"))
 _LISTED = 24  # names that a message lists at most
@@ -98,6 +100,15 @@ def roughness(bsdf: description.RoughConductor | description.RoughDielectric) ->
     if bsdf.alpha_u is not None:
         return ("alpha_u", bsdf.alpha_u), ("alpha_v", bsdf.alpha_v)
     return (("alpha", 0.1 if bsdf.alpha is None else bsdf.alpha),) * 2
+
+
+def resolve_medium(scene: description.Scene, ref: str | description.Medium | None) -> description.Medium | None:
+    """The medium record that `ref` names; a record, or None for vacuum, is returned as it is.
+
+    Raises:
+        SceneError: No medium of the scene has that name.
+    """
+    return _resolve("medium", scene.media, ref)
 
 
 def _resolve(kind, records, ref):

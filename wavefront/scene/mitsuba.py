@@ -22,6 +22,7 @@ from wavefront.scene import description, transforms
 from wavefront.scene.meshes import has_file_normals
 from wavefront.scene.mitsuba_emitters import Emitters
 from wavefront.scene.mitsuba_materials import Materials
+from wavefront.scene.mitsuba_media import Media
 from wavefront.scene.mitsuba_xml import Document, Plugin, read, rows, world_matrix
 
 UNLIMITED_DEPTH = 1000
@@ -68,6 +69,7 @@ class _Importer:
     def __init__(self, document: Document, warn: Callable[[str], object]):
         self.document, self.warn = document, warn
         self.materials = Materials(document, warn)
+        self.media = Media(document, warn)
         self.emitters = Emitters(document, warn, self.materials)
 
     def scene(self):
@@ -89,6 +91,10 @@ class _Importer:
         shapes = [self._shape(plugin) for plugin in groups.get("shape", [])]
         emitters = [self.emitters.emitter(plugin) for plugin in groups.get("emitter", [])]
         self.materials.unused()
+        media = self.media.records()
+        if self.media.found and "integrator" in groups and not groups["integrator"][0].type.startswith("volpath"):
+            plugin = groups["integrator"][0]
+            self.warn(f"{plugin.where()}: {plugin.label()} of Mitsuba leaves media out; here they absorb")
         return description.Scene(
             shapes=shapes,
             camera=camera,
@@ -96,6 +102,7 @@ class _Importer:
             integrator=integrator,
             textures=self.materials.records("texture"),
             bsdfs=self.materials.records("bsdf"),
+            media=media,
             emitters=emitters,
         )
 
@@ -111,13 +118,14 @@ class _Importer:
         if plugin.type not in kinds:
             raise plugin.error(f"{plugin.label()} is not supported; supported: {', '.join(kinds)}")
         camera = kinds[plugin.type](plugin)
+        camera.medium = next(iter(self.media.of(plugin).values()), None)
         for name in ("near_clip", "far_clip"):
             if plugin.get(name) is not None:
                 self.warn(f"{plugin.get(name).where()}: {name} is left out; nothing is clipped")
         plugin.ignore("focus_distance", "shutter_open", "shutter_close", "near_clip", "far_clip")
         spp = self._sampler(plugin)
         film = self._film(plugin)
-        plugin.finish("film", "sampler")
+        plugin.finish("film", "sampler", "medium")
         return camera, film, spp
 
     def _perspective(self, plugin):
@@ -284,10 +292,8 @@ class _Importer:
             common["bsdf"] = description.Diffuse(reflectance=0.0)
         if bsdfs:
             common["bsdf"] = self.materials.bsdf(bsdfs[0])
+        common |= self.media.of(plugin, "interior", "exterior")
         record = kinds[plugin.type](plugin, common, transforms.is_mirror(matrix))
-        for name, child in plugin.resolved():
-            if child.tag == "medium" or name in ("interior", "exterior"):
-                raise child.error(f"participating media are not supported ({name or 'medium'} of {plugin.label()})")
         plugin.finish(*_NESTED)
         return record
 

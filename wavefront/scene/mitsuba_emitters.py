@@ -46,7 +46,9 @@ class Emitters:
         plugin.ignore("sampling_weight")
         record = kinds[plugin.type](plugin)
         record.name = plugin.id
-        plugin.finish()
+        # which medium its light comes through is said by the surfaces around
+        plugin.ignore(*(name for name, child in plugin.resolved() if child.tag == "medium"))
+        plugin.finish("medium")
         return record
 
     def area(self, plugin: Plugin) -> description.Area:

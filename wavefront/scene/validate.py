@@ -11,7 +11,7 @@ import numpy as np
 from wavefront.errors import SceneError
 from wavefront.scene import description
 from wavefront.scene.ior import CONDUCTORS, INDEX_OF_REFRACTION
-from wavefront.scene.lookup import BSDF_FIELDS, NUMBER_FIELDS, TEXTURE_FIELDS, shown, unknown_name, walk
+from wavefront.scene.lookup import BSDF_FIELDS, MEDIUM_FIELDS, NUMBER_FIELDS, TEXTURE_FIELDS, shown, unknown_name, walk
 from wavefront.scene.meshes import LARGEST_COORDINATE
 from wavefront.scene.transforms import to_matrix
 
@@ -33,9 +33,10 @@ def validate(
         _check_names(scene)
         bsdfs = {bsdf.name: bsdf for bsdf in scene.bsdfs if bsdf.name}
         textures = {texture.name for texture in scene.textures if texture.name}
+        media = {medium.name for medium in scene.media if medium.name}
         for path, record in walk(scene):
             _check_numbers(record, path)
-            _check_references(record, path, bsdfs, textures)
+            _check_references(record, path, bsdfs, textures, media)
             if hasattr(record, "alpha_u"):
                 _check_roughness(record, path)
             if isinstance(record, (description.Bitmap, description.Envmap)):
@@ -50,6 +51,8 @@ def validate(
                 _check_mesh(record, path)
             elif isinstance(record, (description.TwoSided, description.Mask)):
                 _check_nesting(record, path, bsdfs)
+            elif isinstance(record, description.Homogeneous):
+                _check_value([record.scale * value for value in np.ravel(record.sigma_a).tolist()], f"{path}.sigma_a")
         for i, shape in enumerate(scene.shapes):
             matrix = _check_transform(shape.to_world, f"shapes[{i}].to_world")
             if isinstance(shape, description.Sphere) and matrix is not None and not _is_similarity(matrix):
@@ -88,7 +91,7 @@ def _find_warnings(scene):
             warnings.append(
                 f"emitters[{i}]: a {kind} light adds nothing where integrator.nee is false: no ray meets it"
             )
-    for kind in ("textures", "bsdfs"):
+    for kind in ("textures", "bsdfs", "media"):
         for i, record in enumerate(getattr(scene, kind)):
             if not record.name:
                 warnings.append(f"{kind}[{i}] has no name, so nothing can refer to it")
@@ -99,7 +102,7 @@ def _find_warnings(scene):
 
 
 def _check_names(scene):
-    for kind in ("textures", "bsdfs", "emitters", "shapes"):
+    for kind in ("textures", "bsdfs", "media", "emitters", "shapes"):
         seen = set()
         for i, record in enumerate(getattr(scene, kind)):
             if record.name and record.name in seen:
@@ -107,7 +110,7 @@ def _check_names(scene):
             seen.add(record.name)
 
 
-def _check_references(record, path, bsdfs, textures):
+def _check_references(record, path, bsdfs, textures, media):
     for field in record.__struct_fields__:
         value = getattr(record, field)
         if isinstance(value, str):
@@ -115,6 +118,8 @@ def _check_references(record, path, bsdfs, textures):
                 _fail(f"{path}.{field}", unknown_name("texture", value, textures))
             if field in BSDF_FIELDS and value not in bsdfs:
                 _fail(f"{path}.{field}", unknown_name("BSDF", value, bsdfs))
+            if field in MEDIUM_FIELDS and value not in media:
+                _fail(f"{path}.{field}", unknown_name("medium", value, media))
 
 
 # --- BSDFs -----------------------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from wavefront.bsdf.tables import MaterialTables
 from wavefront.light.mis import power_heuristic
 from wavefront.light.sampling import make_light_sampler
 from wavefront.light.tables import DELTA, LightTables
+from wavefront.medium import medium_towards, transmittance
 from wavefront.queues import (
     DEPTH,
     NONFINITE_DIRECT,
@@ -37,6 +38,7 @@ def make_direct(
     light_textures: tuple[str, ...],
     uvs: bool,
     tangents: bool,
+    media: bool = False,
 ):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
     eval_bsdf, _, _ = make_bsdf(bsdfs, mask, textures, tangents)
@@ -94,6 +96,12 @@ def make_direct(
             wp.atomic_add(counters, NONFINITE_DIRECT, 1)
             return
         origin = spawn_origin(position, surfaces.geometric_normal[slot], surfaces.offset[slot], light.wi)
+        if wp.static(media):
+            medium = medium_towards(surfaces.media[slot], surfaces.geometric_normal[slot], light.wi)
+            distance = wp.where(light.t_max < INFINITE, wp.length(light.target - position), INFINITE)
+            L = wp.cw_mul(L, transmittance(geometry.sigma_a[medium], distance))
+            if wp.max(L) == 0.0:
+                return
         shadow_rays.origin[slot] = origin
         shadow_rays.direction[slot] = wp.where(light.t_max < INFINITE, light.target - origin, light.wi)
         shadow_rays.t_max[slot] = light.t_max

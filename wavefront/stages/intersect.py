@@ -6,7 +6,8 @@ import functools
 
 import warp as wp
 
-from wavefront.accel.mesh_query import Geometry, make_intersector
+from wavefront.accel.mesh_query import INFINITE, Geometry, make_intersector
+from wavefront.medium import transmittance
 from wavefront.queues import DEPTH, Paths, Queue, Surfaces, push, queue_size
 from wavefront.surface import make_vertex
 
@@ -21,6 +22,7 @@ def make_intersect(
     area_lights: bool,
     escape_lights: bool,
     shape_index: bool = False,
+    media: bool = False,
 ):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name (or whether there are any).
 
@@ -32,7 +34,7 @@ def make_intersect(
     @wp.kernel(enable_backward=False, module="unique")
     def closest_hits(
         geometry: Geometry,
-        paths: Paths,
+        paths: Paths,  # also out, where a medium absorbs
         rays: Queue,
         max_depth: int,
         # out
@@ -49,8 +51,19 @@ def make_intersect(
         origin = paths.origin[slot]
         direction = paths.direction[slot]
         hit = closest_hit(geometry, origin, direction)
+        if wp.static(media):
+            medium = geometry.camera_medium
+            start = origin
+            if counters[DEPTH] > 0:
+                medium = paths.medium[slot]
+                start = surfaces.position[
+                    slot
+                ]  # the last vertex: the ray starts off it, as far as a sheet may be thick
+            sigma_a = geometry.sigma_a[medium]
         if hit.primitive < 0:
             surfaces.material[slot] = -1
+            if wp.static(media):
+                paths.beta[slot] = wp.cw_mul(paths.beta[slot], transmittance(sigma_a, INFINITE))
             if wp.static(escape_lights):
                 push(escaped, slot, counters)
             return
@@ -67,6 +80,11 @@ def make_intersect(
             surfaces.tangent[slot] = vertex.tangent
         if wp.static(shape_index):
             surfaces.shape[slot] = shape.index
+        if wp.static(media):
+            sides = wp.vec2i(shape.exterior, shape.interior)
+            surfaces.media[slot] = wp.where(shape.exterior < 0, wp.vec2i(medium, medium), sides)
+            distance = wp.length(vertex.position - start)
+            paths.beta[slot] = wp.cw_mul(paths.beta[slot], transmittance(sigma_a, distance))
         if wp.static(area_lights):
             light = int(-1)
             front = wp.dot(vertex.geometric_normal, direction) < 0.0

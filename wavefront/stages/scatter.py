@@ -9,6 +9,7 @@ import warp as wp
 from wavefront.bsdf.dispatch import make_bsdf
 from wavefront.bsdf.frame import make_frame
 from wavefront.bsdf.tables import MaterialTables
+from wavefront.medium import medium_towards
 from wavefront.queues import DEPTH, NONFINITE_SCATTER, Paths, Queue, Surfaces, push, queue_size
 from wavefront.rng import PURPOSE_BSDF, uniform4
 from wavefront.surface import spawn_origin
@@ -31,6 +32,7 @@ def make_scatter(
     tangents: bool,
     transmission: bool,
     roulette: bool,
+    media: bool = False,
 ):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
     _, sample_bsdf, _ = make_bsdf(bsdfs, mask, textures, tangents)
@@ -92,6 +94,8 @@ def make_scatter(
         paths.beta[slot] = beta
         paths.direction[slot] = wi
         paths.pdf[slot] = bsdf.pdf
+        if wp.static(media):
+            paths.medium[slot] = medium_towards(surfaces.media[slot], surfaces.geometric_normal[slot], wi)
         paths.origin[slot] = spawn_origin(
             surfaces.position[slot], surfaces.geometric_normal[slot], surfaces.offset[slot], wi
         )
