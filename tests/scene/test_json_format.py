@@ -85,7 +85,8 @@ def test_text_that_is_not_json_is_refused_with_its_place(error, raw, message):
     [
         (
             {"film": {"widht": 3}},
-            "film: unknown key 'widht'; did you mean 'width'? valid keys: width, height, crop, pixel_aspect, filter, aovs, precision",
+            "film: unknown key 'widht'; did you mean 'width'? valid keys: width, height, crop, pixel_aspect, filter, "
+            "aovs, precision",
         ),
         (
             {"fiml": {}},
