@@ -32,6 +32,8 @@ from wavefront.warp_samples import square_to_gaussian, square_to_tent
 TEXTURES = ("bytes", "checkerboard", "floats")
 LIGHTS = tuple(sorted(set(LIGHT_KINDS) - {"envmap_bytes", "envmap_halves"}))  # of environment maps, those of floats
 BOX, TENT, GAUSSIAN = wp.constant(0), wp.constant(1), wp.constant(2)
+CAMERAS = ("perspective", "thin_lens", "orthographic")
+THIN_LENS, ORTHOGRAPHIC = wp.constant(1), wp.constant(2)
 FILTERS = {"box": 0, "tent": 1, "gaussian": 2}
 
 
@@ -43,6 +45,7 @@ class Settings:
     max_depth: wp.int32
     rr_depth: wp.int32  # 2^30: never
     nee: wp.int32
+    camera: wp.int32
     filter: wp.int32
     filter_scale: wp.float32
     seed: wp.uint64
@@ -60,11 +63,9 @@ def absorbed(sigma_a: wp.array[wp.vec3], medium: int, distance: float) -> wp.vec
 
 
 @functools.cache
-def make_megakernel(
-    camera_kind: str, triangles: bool, spheres: bool, smooth: bool, uvs: bool, tangents: bool, nee: bool
-):
+def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool, tangents: bool, nee: bool):
     """Only what a scene lacks memory for is left out: kinds of primitive, vertex normals, UVs, tables of sampling."""
-    camera_ray = make_camera_ray(camera_kind)
+    perspective, thin_lens, orthographic = (make_camera_ray(kind) for kind in CAMERAS)
     closest_hit, occluded = make_intersector(triangles, spheres)
     vertex_of = make_vertex(triangles, spheres, smooth, uvs, tangents)
     eval_bsdf, sample_bsdf, _ = make_bsdf(tuple(sorted(BSDF_KINDS)), True, TEXTURES, tangents)
@@ -97,7 +98,11 @@ def make_megakernel(
             shift = settings.filter_scale * square_to_gaussian(wp.vec2(u[0], u[1]))
         x = float(pixel % settings.width) + 0.5 + shift[0]
         y = float(pixel // settings.width) + 0.5 + shift[1]
-        ray = camera_ray(camera, x, y, wp.vec2(u[2], u[3]))
+        ray = perspective(camera, x, y, wp.vec2(u[2], u[3]))
+        if settings.camera == THIN_LENS:
+            ray = thin_lens(camera, x, y, wp.vec2(u[2], u[3]))
+        if settings.camera == ORTHOGRAPHIC:
+            ray = orthographic(camera, x, y, wp.vec2(u[2], u[3]))
         origin = ray.origin
         direction = ray.direction
 
@@ -219,11 +224,11 @@ def render_megakernel(renderer: Renderer, spp: int) -> np.ndarray:
     kind = film.filter.__struct_config__.tag
     settings.filter = FILTERS[kind]
     settings.filter_scale = {"box": 0.5}.get(kind) or getattr(film.filter, "radius", 0.0) or film.filter.stddev
+    settings.camera = CAMERAS.index(camera_kind(scene.camera))
     settings.seed = renderer.seed
     n = film.width * film.height * spp
     result = wp.zeros(n, dtype=wp.vec3, device="cpu")
-    kind = camera_kind(scene.camera)
-    kernel = make_megakernel(kind, f.triangles, f.spheres, f.smooth, f.uvs, f.tangents, f.nee)
+    kernel = make_megakernel(f.triangles, f.spheres, f.smooth, f.uvs, f.tangents, f.nee)
     d = device_scene
     inputs = [make_camera(scene.camera, film), d.geometry, d.materials, d.textures, d.lights, settings]
     wp.launch(kernel, dim=n, inputs=inputs, outputs=[result], device="cpu")

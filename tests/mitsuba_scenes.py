@@ -388,6 +388,27 @@ CAMERAS: dict[str, tuple[str, tuple[int, int]]] = {
 }
 
 
+# Type and elements of the sensor. The subject is 6.2 m away.
+SENSORS: dict[str, tuple[str, str]] = {
+    "thin lens": ("thinlens", '<float name="aperture_radius" value="0.4"/><float name="focus_distance" value="5"/>'),
+    "thin lens, far focus": (
+        "thinlens",
+        '<float name="aperture_radius" value="0.2"/><float name="focus_distance" value="12"/>',
+    ),
+    "orthographic": ("orthographic", ""),
+}
+
+
+def with_sensor(text: str, name: str) -> str:
+    """A document with another sensor in the same place."""
+    kind, body = SENSORS[name]
+    fov = '<float name="fov" value="27"/>'
+    text = text.replace('type="perspective"', f'type="{kind}"')
+    if kind == "orthographic":
+        return text.replace(fov, "").replace("<lookat origin", '<scale x="1.4" y="1.4"/><lookat origin', 1)
+    return text.replace(fov, fov + body)
+
+
 def write_files(folder: Path) -> None:
     """Writes the mesh and the images that the scenes refer to."""
     rng = np.random.default_rng(1)

@@ -61,6 +61,20 @@ def test_filters(filter_name):
     check(scene)
 
 
+LOOK = [d.TransformStep(look_at=d.LookAt(origin=(0.2, 1.0, 4.2), target=(0.0, 1.0, 0.0)))]
+CAMERAS = {
+    "thin lens": d.ThinLens(fov=38.0, aperture_radius=0.2, focus_distance=3.5, to_world=LOOK),
+    "orthographic": d.Orthographic(width=2.4, to_world=LOOK),
+}
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_cameras(name):
+    scene = own("cornell-box", "integrator.max_depth=2")
+    scene.camera = CAMERAS[name]
+    check(scene)
+
+
 DEFAULT = [
     "glossy-plates",
     "glass-caustic",

@@ -118,6 +118,21 @@ def test_camera(folder, axis):
     check_small(folder, axis, text, size)
 
 
+@pytest.mark.parametrize("name", scenes.SENSORS)
+def test_sensor(folder, name):
+    check_small(folder, name, scenes.with_sensor(scenes.document(scenes.PLAIN["smooth mesh"], everything=False), name))
+
+
+def test_records_of_a_thin_lens_and_a_window(folder):
+    """Mitsuba's image of our records, of a window of the film, and ours."""
+    path = folder / "scene.xml"
+    path.write_text(scenes.with_sensor(scenes.document(scenes.PLAIN["diffuse"], everything=False), "thin lens"))
+    scene = like_the_peer(load_scene(path), 60, 50, scenes.MAX_DEPTH)
+    scene.film.crop = description.Crop(x=20, y=7, width=32, height=32)
+    theirs = their_batches(peer.load_records(scene), scenes.MAX_DEPTH, 32)
+    check("window", compare(our_batches(scene, 32, "window"), theirs, TILES))
+
+
 def test_without_light_sampling(folder):
     """The mean is the same; Mitsuba always samples lights."""
     check_small(folder, "no light sampling", scenes.document(scenes.MIXED["sky"], everything=True), nee=False)

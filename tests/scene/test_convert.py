@@ -65,6 +65,22 @@ def test_converted_scene_is_the_same_scene(scene_file, tmp_path, capsys):
             np.testing.assert_allclose(a.normals, b.normals, atol=1e-6)
 
 
+def test_cameras_and_films_are_converted(scene_file, tmp_path):
+    lens = '<float name="aperture_radius" value="0.1"/><float name="focus_distance" value="2"/>'
+    crop = "".join(
+        f'<integer name="{name}" value="{value}"/>' for name, value in (("crop_offset_y", 5), ("crop_height", 9))
+    )
+    text = scene_file.read_text().replace(
+        'type="perspective"><', f'type="thinlens">{lens}<film type="hdrfilm">{crop}</film><'
+    )
+    scene_file.write_text(text)
+    out = tmp_path / "out.json"
+    assert convert.main([str(scene_file), str(out), "--quiet"]) == 0
+    first, second = load_scene(scene_file, warn=lambda message: None), load_scene(out)
+    assert (first.camera, first.film) == (second.camera, second.film)
+    assert (second.camera.aperture_radius, second.film.crop) == (0.1, d.Crop(x=0, y=5, width=768, height=9))
+
+
 def test_converting_again_replaces_the_folders(scene_file, tmp_path):
     out = tmp_path / "room.json"
     convert.main([str(scene_file), str(out), "--quiet"])

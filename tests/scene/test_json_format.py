@@ -130,6 +130,25 @@ def test_text_that_is_not_json_is_refused_with_its_place(error, raw, message):
         ),
         ({"film": {"width": 2.5}}, "film.width: expected an integer >= 1 and <= 65536; found 2.5"),
         ({"camera": {"fov": 180}}, "camera.fov: expected a number > 0 and < 180; found 180"),
+        (
+            {"camera": {"type": "fisheye"}},
+            "camera.type: unknown type 'fisheye'; allowed: 'perspective', 'thin_lens', 'orthographic'",
+        ),
+        ({"camera": {"type": "thin_lens", "aperture_radius": 1}}, "camera: missing key 'focus_distance'"),
+        (
+            {"camera": {"type": "thin_lens", "aperture_radius": -1, "focus_distance": 2}},
+            "camera.aperture_radius: expected a number >= 0; found -1",
+        ),
+        (
+            {"camera": {"type": "orthographic", "fov": 3}},
+            "camera: unknown key 'fov'; valid keys: type, width, to_world",
+        ),
+        ({"film": {"crop": {"width": 3}}}, "film.crop: missing key 'height'"),
+        (
+            {"film": {"width": 20, "height": 10, "crop": {"x": 18, "width": 3, "height": 10}}},
+            "film.crop: expected a window inside the film of 20x10 pixels; found 3x10 at (18, 0)",
+        ),
+        ({"film": {"pixel_aspect": 0}}, "film.pixel_aspect: expected a number >= 0.01 and <= 100; found 0"),
         ({"integrator": {"nee": 1}}, "integrator.nee: expected true or false; found 1"),
         (
             {"film": {"aovs": ["albdo"]}},
@@ -232,6 +251,23 @@ def test_overrides_of_a_scene_in_memory():
     with pytest.raises(SceneError) as caught:
         json_format.checked(d.Scene(bsdfs=[d.Diffuse(reflectance=-1.0)]))
     assert str(caught.value).startswith("bsdfs[0].reflectance: expected a number >= 0 and <= 1, ")
+
+
+CAMERAS = [
+    d.Perspective(fov=30.0, principal_point_offset=(0.25, -0.5)),
+    d.ThinLens(fov=30.0, fov_axis="y", aperture_radius=0.1, focus_distance=3.0),
+    d.Orthographic(width=3.0, to_world=[d.TransformStep(scale=2.0)]),
+]
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_every_camera_and_film_is_read_as_written(camera, write, tmp_path):
+    film = d.Film(crop=d.Crop(x=1, y=2, width=30, height=40), pixel_aspect=1.5, aovs=["uv", "bsdf_index"])
+    scene = d.Scene(camera=camera, film=film)
+    text = json_format.dumps(scene, tmp_path)
+    assert json_format.load(write(text)) == scene
+    jsonschema = pytest.importorskip("jsonschema")
+    jsonschema.validate(json.loads(text), json_format.schema())
 
 
 # --- include ---------------------------------------------------------------------------------------------------

@@ -377,6 +377,73 @@ def test_filters(load_xml, body, expected, warns):
     assert any("rfilter" in warning for warning in load_xml.warnings) == warns
 
 
+def sensor(kind, body="", film=""):
+    return f'<sensor type="{kind}">{body}<film type="hdrfilm">{film}</film></sensor>'
+
+
+LENS = '<float name="aperture_radius" value="0.5"/>'
+
+
+@pytest.mark.parametrize(
+    ("kind", "body", "expected"),
+    [
+        (
+            "perspective",
+            '<float name="fov" value="30"/><float name="principal_point_offset_y" value="0.25"/>',
+            d.Perspective(fov=30.0, principal_point_offset=(0.0, 0.25)),
+        ),
+        (
+            "thinlens",
+            '<float name="fov" value="30"/><string name="fov_axis" value="y"/><float name="focus_distance" value="3"/>'
+            + LENS,
+            d.ThinLens(fov=30.0, fov_axis="y", aperture_radius=0.5, focus_distance=3.0),
+        ),
+        (
+            "thinlens",
+            '<float name="fov" value="30"/>' + LENS,
+            d.ThinLens(fov=30, aperture_radius=0.5, focus_distance=1e4),
+        ),
+        ("orthographic", "", d.Orthographic(width=2.0)),
+    ],
+)
+@pytest.mark.parametrize("version", ["0.5.0", "3.0.0"])
+def test_cameras(load_xml, kind, body, expected, version):
+    body = in_old_words(body) if version < "3" else body
+    camera = load_xml(sensor(kind, body), version, sensor=False).camera
+    matrix = to_matrix(camera.to_world)
+    camera.to_world = []
+    assert camera == expected
+    np.testing.assert_array_equal(matrix, np.diag([-1.0, 1.0, -1.0, 1.0]))
+    assert not [warning for warning in load_xml.warnings if "integrator" not in warning]
+
+
+def test_clip_planes_are_a_warning(load_xml):
+    load_xml(sensor("thinlens", LENS + '<float name="near_clip" value="1"/>'), sensor=False)
+    assert any("near_clip is left out; nothing is clipped" in warning for warning in load_xml.warnings)
+
+
+def film_numbers(**numbers):
+    return "".join(f'<integer name="{name}" value="{value}"/>' for name, value in numbers.items())
+
+
+@pytest.mark.parametrize(
+    ("numbers", "expected"),
+    [
+        ({}, None),
+        ({"crop_offset_x": 0, "crop_width": 60}, None),
+        ({"crop_offset_x": 10, "crop_width": 50}, d.Crop(x=10, y=0, width=50, height=40)),
+        (
+            {"crop_offset_x": 1, "crop_offset_y": 39, "crop_width": 2, "crop_height": 1},
+            d.Crop(x=1, y=39, width=2, height=1),
+        ),
+    ],
+)
+def test_crop_windows(load_xml, numbers, expected):
+    film = load_xml(sensor("perspective", film=film_numbers(width=60, height=40, **numbers)), sensor=False).film
+    assert film.crop == expected
+    assert (film.width, film.height) == (60, 40)
+
+
 # --- structure: names, references, parameters, includes ----------------------------------------------------------
 
 DIALECT = """

@@ -32,7 +32,43 @@ def envmap(body):
     return f'<emitter type="envmap"><string name="filename" value="colours.png"/>{body}</emitter>'
 
 
+def sensor(kind, body="", film=""):
+    """A sensor whose properties are in line 3, those of its film in line 4."""
+    return f'<sensor type="{kind}">\n{body}<film type="hdrfilm">\n{film}</film></sensor>'
+
+
 ERRORS = [
+    (sensor("fisheye"), 2, "sensor 'fisheye' is not supported; supported: perspective, thinlens, orthographic"),
+    (sensor("thinlens"), 2, "sensor 'thinlens' needs an aperture_radius"),
+    (
+        sensor("thinlens", '<float name="aperture_radius" value="-1"/>'),
+        3,
+        "aperture_radius must be at least 0; found -1",
+    ),
+    (
+        sensor("thinlens", '<float name="focus_distance" value="0"/><float name="aperture_radius" value="1"/>'),
+        3,
+        "focus_distance must be greater than 0; found 0",
+    ),
+    (sensor("thinlens", '<float name="fov" value="180"/><float name="aperture_radius" value="1"/>'), 2, "fov must be"),
+    (sensor("orthographic", '<float name="fov" value="30"/>'), 3, "sensor 'orthographic' has no property 'fov'"),
+    (
+        sensor(
+            "perspective", film='<integer name="crop_offset_x" value="700"/><integer name="crop_width" value="69"/>'
+        ),
+        4,
+        "the crop window must lie in the width of 768; found 69 from 700 on",
+    ),
+    (
+        sensor("perspective", film='<integer name="crop_offset_y" value="1"/>'),
+        4,
+        "in the height of 576; found 576 from 1",
+    ),
+    (
+        sensor("perspective", film='<integer name="crop_height" value="0"/>'),
+        4,
+        "in the height of 576; found 0 from 0 on",
+    ),
     ('\n\n<shape type="cylinder"/>', 4, "shape 'cylinder' is not supported; supported: obj, ply, rectangle"),
     ('<shape type="serialized"/>', 2, "shape 'serialized' is not supported"),
     (on_shape('\n<bsdf type="plaster"/>'), 3, "bsdf 'plaster' is not supported; supported: diffuse"),

@@ -7,7 +7,7 @@ from scipy import special
 
 from tests.stages.harness import Counters, array, launch, paths, uniforms, unit
 from wavefront import queues
-from wavefront.camera import make_camera
+from wavefront.camera import camera_kind, make_camera
 from wavefront.film import make_window
 from wavefront.rng import PURPOSE_CAMERA
 from wavefront.scene import description as d
@@ -20,10 +20,12 @@ COUNT = 6 * 4 * 2
 ORIGIN, TARGET = np.array([1.0, 2.0, 3.0]), np.array([0.0, 1.5, -1.0])
 
 
-def generate(kind, scale, fov_axis="x", transmission=False, tile=TILE):
-    look_at = d.LookAt(origin=tuple(ORIGIN), target=tuple(TARGET))
-    camera = d.Perspective(fov=50.0, fov_axis=fov_axis, to_world=[d.TransformStep(look_at=look_at)])
-    film = d.Film(width=WIDTH, height=HEIGHT)
+LOOK_AT = [d.TransformStep(look_at=d.LookAt(origin=tuple(ORIGIN), target=tuple(TARGET)))]
+
+
+def generate(kind, scale, fov_axis="x", transmission=False, tile=TILE, camera=None, crop=None):
+    camera = camera or d.Perspective(fov=50.0, fov_axis=fov_axis, to_world=LOOK_AT)
+    film = d.Film(width=WIDTH, height=HEIGHT, crop=crop)
     record = make_camera(camera, film)
     counters = Counters(depth=9)
     capacity = COUNT + 10
@@ -32,7 +34,7 @@ def generate(kind, scale, fov_axis="x", transmission=False, tile=TILE):
     rays = counters.queue("rays", capacity=capacity)
     counters.array.numpy()[:] = 5
     arguments = [record, array(np.array(tile, np.int32), wp.int32), make_window(film), scale, wp.uint64(SEED)]
-    kernel = make_generate("perspective", kind, transmission)
+    kernel = make_generate(camera_kind(camera), kind, transmission)
     launch(kernel, capacity, *arguments, p, rays, counters.array, counters.totals)
     return p, rays, counters
 
@@ -101,3 +103,32 @@ def test_counters():
     for index in (queues.STATUS, *queues.NONFINITE_STAGES.values()):
         assert counters[index] == 5
     assert counters.totals.numpy().tolist() == [0, 0, COUNT]
+
+
+CROP = d.Crop(x=3, y=2, width=20, height=25)
+
+
+@pytest.mark.parametrize("lens", [False, True])
+def test_a_window_holds_pixels_of_the_whole_film(lens):
+    """The same rays and keys to the last bit."""
+    place = {"fov": 50.0, "to_world": LOOK_AT}
+    camera = d.ThinLens(aperture_radius=0.3, focus_distance=2.0, **place) if lens else d.Perspective(**place)
+    whole, _, _ = generate("box", 0.5, camera=camera)
+    moved = (TILE[0] - CROP.x, TILE[1] - CROP.y, *TILE[2:])
+    window, _, _ = generate("box", 0.5, camera=camera, tile=moved, crop=CROP)
+    for name in ("origin", "direction", "pixel", "sample"):
+        np.testing.assert_array_equal(getattr(window, name).numpy(), getattr(whole, name).numpy())
+    assert (len(np.unique(whole.origin.numpy()[:COUNT], axis=0)) > 1) == lens
+
+
+def test_the_lens_has_its_own_numbers():
+    """The third and fourth of the camera's random numbers: a point of the lens goes with the numbers it was mapped from
+    by the concentric map, whose radius is the larger of the two coordinates of the square."""
+    camera = d.ThinLens(fov=50.0, aperture_radius=0.3, focus_distance=2.0, to_world=LOOK_AT)
+    p, _, _ = generate("box", 0.5, camera=camera)
+    x, y, sample = expected_slots()
+    u = uniforms(SEED, y * WIDTH + x, sample, 0, int(PURPOSE_CAMERA))
+    lens = p.origin.numpy()[:COUNT] - ORIGIN
+    radius = 0.3 * np.abs(2.0 * u[:, 2:] - 1.0).max(axis=1)
+    np.testing.assert_allclose(np.linalg.norm(lens, axis=1), radius, atol=2e-6)
+    np.testing.assert_allclose(lens @ unit(TARGET - ORIGIN), 0.0, atol=1e-6)

@@ -487,7 +487,7 @@ class ThinLens(Perspective, kw_only=True, tag_field="type", tag="thin_lens"):
         NonNegative, Meta(description="Radius of the lens in metres, before to_world; 0 is a pinhole.")
     ]
     focus_distance: Annotated[
-        Positive, Meta(description="Of the plane that is sharp, along local -Z, in metres, before to_world.")
+        float, Meta(ge=1e-6, description="Of the plane that is sharp, along local -Z, in metres, before to_world.")
     ]
 
 

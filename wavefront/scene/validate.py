@@ -59,9 +59,7 @@ def validate(
                 _fail(
                     f"shapes[{i}].to_world", "a sphere can be scaled uniformly only; found different scales or a shear"
                 )
-        matrix = _check_transform(scene.camera.to_world, "camera.to_world")
-        if matrix is not None and np.abs(matrix[:3, 3]).max() > LARGEST_COORDINATE:
-            _fail("camera.to_world", f"the camera is beyond {LARGEST_COORDINATE:g} m, where 32-bit rays hit nothing")
+        _check_camera(scene.camera)
         _check_crop(scene.film)
         _check_emitters(scene)
         for i, aov in enumerate(scene.film.aovs):
@@ -211,7 +209,19 @@ def _check_emitters(scene):
             _fail(path, "a sun has irradiance or radiance; found both")
 
 
-# --- film ------------------------------------------------------------------------------------------------------
+# --- camera and film -------------------------------------------------------------------------------------------
+
+
+def _check_camera(camera):
+    matrix = _check_transform(camera.to_world, "camera.to_world")
+    if matrix is not None and np.abs(matrix[:3, 3]).max() > LARGEST_COORDINATE:
+        _fail("camera.to_world", f"the camera is beyond {LARGEST_COORDINATE:g} m, where 32-bit rays hit nothing")
+    scale = 1.0 if matrix is None else np.abs(matrix[:3, :3]).max()
+    for name in ("aperture_radius", "width"):
+        if getattr(camera, name, 0.0) * scale > _LARGEST:
+            _fail(
+                f"camera.{name}", f"times the scale of to_world it is above {_LARGEST:.4g}, too large for 32-bit floats"
+            )
 
 
 def _check_crop(film):
