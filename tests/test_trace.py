@@ -14,7 +14,7 @@ from wavefront import Renderer, WavefrontError, load_scene
 from wavefront.film import LUMINANCE
 from wavefront.render import main
 from wavefront.scene import description as d
-from wavefront.strict import NonFiniteError
+from wavefront.strict import NonFiniteError, first_pixel
 
 SCENES = Path(__file__).parent.parent / "scenes"
 NAMES = ["cornell-box", "glossy-plates", "glass-caustic", "material-mask", "material-diffuse-bitmap"]
@@ -244,6 +244,21 @@ def resume_strictly(lenient, scene):
     with tempfile.TemporaryDirectory() as folder:
         lenient.save_checkpoint(f"{folder}/c")
         Renderer(scene, seed=9, threads=1, strict=True).load_checkpoint(f"{folder}/c")
+
+
+def test_the_search_finds_the_first_pixel():
+    generator = np.random.default_rng(2)
+    for _ in range(500):
+        height, width, capacity = generator.integers(1, 14, 3)
+        bad = generator.random((height, width)) < generator.choice([0.0, 0.02, 0.2, 1.0])
+
+        def found(x, y, w, h, bad=bad, capacity=capacity):
+            assert 0 < w * h <= capacity and x + w <= bad.shape[1] and y + h <= bad.shape[0]
+            return bad[y : y + h, x : x + w].any()
+
+        places = np.argwhere(bad)
+        expected = (places[0][1], places[0][0]) if len(places) else None
+        assert first_pixel(found, width, height, capacity) == expected
 
 
 def test_a_search_in_narrow_tiles(monkeypatch):
