@@ -7,6 +7,7 @@ import errno
 import fcntl
 import json
 import os
+import pkgutil
 import random
 import resource
 import signal
@@ -272,7 +273,7 @@ def test_two_processes_do_not_write_one_checkpoint(checkpoint):
         fcntl.flock(other, fcntl.LOCK_EX)
         with pytest.raises(CheckpointError, match="another process is writing it"):
             renderer().save_checkpoint(checkpoint)
-    assert checkpoint.read_bytes() == good
+    assert checkpoint.read_bytes() == good and temporary.read_bytes().startswith(b"left by")
     renderer().save_checkpoint(checkpoint)
     assert os.listdir(checkpoint.parent) == [checkpoint.name]
 
@@ -427,7 +428,7 @@ def wait_for(process, word):
 
 def test_killed_at_random_moments(tmp_path):
     """Killed four times, with a checkpoint after every pass so that some kills come while one is written."""
-    spp = 300
+    spp = 200
     options = ("--size", "61x47", "--aov", "albedo,normal,depth,variance", "--spp", spp, "--seed", 7)
     file = tmp_path / "c"
     resumed = ("--checkpoint", file, "--resume", file, "--every", 1e-3)
@@ -456,6 +457,39 @@ def test_killed_at_random_moments(tmp_path):
     accounts = [json.loads((tmp_path / f"{name}.json").read_text()) for name in ("resumed", "whole")]
     for key in ("paths", "rays", "shadow_rays", "nonfinite", "samples_per_pixel"):
         assert accounts[0][key] == accounts[1][key]
+
+
+@pytest.mark.parametrize(
+    ("function", "call"),
+    [("numpy.lib.format.write_array_header_1_0", 1), ("numpy.lib.format.write_array_header_1_0", 2),
+     ("zipfile.ZipFile.close", 1), ("os.fsync", 1), ("os.replace", 1), ("os.fsync", 2)],
+)  # fmt: skip
+def test_killed_while_writing(checkpoint, monkeypatch, function, call):
+    """At each step of it: the file is the old checkpoint or the new one."""
+    r = renderer()
+    r.render(1)
+    module, _, name = function.rpartition(".")
+    calls, real = [], getattr(pkgutil.resolve_name(module), name)
+
+    def killed(*arguments, **options):
+        calls.append(function)
+        if len(calls) == call:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return real(*arguments, **options)
+
+    child = os.fork()
+    if child == 0:
+        monkeypatch.setattr(function, killed)
+        with contextlib.suppress(BaseException):
+            r.save_checkpoint(checkpoint)
+        os._exit(1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+    again = renderer()
+    again.load_checkpoint(checkpoint)
+    assert again.sample_count == (1 if (function, call) == ("os.fsync", 2) else SPP // 2)
+    # What is left of it is in nobody's way.
+    r.save_checkpoint(checkpoint)
+    assert os.listdir(checkpoint.parent) == [checkpoint.name]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

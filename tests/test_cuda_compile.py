@@ -11,6 +11,7 @@ from wavefront.bsdf.tables import KINDS
 from wavefront.features import Features
 from wavefront.film import FIRST_HIT
 from wavefront.integrator import make_kernels
+from wavefront.stages.inspect import make_inspect_hit, make_inspect_light
 
 CORNELL_BOX = Features(
     triangles=True,
@@ -72,7 +73,18 @@ CHANGES = [
 
 def compile_for_cuda(features: Features, arch: int, folder) -> int:
     """Compiles all stages for `arch`, writes PTX or CUBIN to `folder`, and returns the number of modules."""
-    modules = make_kernels(features).modules()
+    return compile_modules(make_kernels(features).modules(), arch, folder)
+
+
+def compile_inspectors(f: Features, arch: int, folder) -> int:
+    """The same for the kernels of a traced path."""
+    kernels = [make_inspect_hit(f.triangles, f.spheres)]
+    if f.light_sampling:
+        kernels.append(make_inspect_light(f.lights, f.light_textures))
+    return compile_modules([kernel.module for kernel in kernels], arch, folder)
+
+
+def compile_modules(modules: list, arch: int, folder) -> int:
     for module in modules:
         wp.compile_aot_module(module, arch=arch, module_dir=str(folder))
     return len(modules)
@@ -85,10 +97,15 @@ def test_one_feature_set_compiles_for_cuda(tmp_path):
     assert all(path.stat().st_size > 500 for path in built)
 
 
+def test_kernels_of_a_traced_path_compile_for_cuda(tmp_path):
+    assert compile_inspectors(CORNELL_BOX, 90, tmp_path) == 2
+    assert len([path for path in tmp_path.iterdir() if path.suffix in (".ptx", ".cubin")]) == 2
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("arch", [80, 90])
 @pytest.mark.parametrize("change", range(len(CHANGES)))
 def test_all_feature_sets_compile_for_cuda(tmp_path, arch, change):
     features = dataclasses.replace(EVERYTHING, **CHANGES[change])
-    count = compile_for_cuda(features, arch, tmp_path)
+    count = compile_for_cuda(features, arch, tmp_path) + compile_inspectors(features, arch, tmp_path)
     assert len([path for path in tmp_path.iterdir() if path.suffix in (".ptx", ".cubin")]) == count

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from wavefront.errors import WavefrontError
 from wavefront.integrator import Tile, Worker
 from wavefront.trace import TraceWorker, worker_arguments
@@ -35,28 +37,46 @@ def find_nonfinite(renderer, first_sample: int, sample_count: int) -> NonFiniteE
         renderer: After a pass that counted such a contribution.
         first_sample, sample_count: The samples of that pass.
     """
-    width, height = renderer.film.width, renderer.film.height
     worker = Worker(**worker_arguments(renderer, min(SEARCH_CAPACITY, renderer.capacity)))
-
-    def found(x, y, columns, rows, sample) -> bool:
-        before = sum(worker.nonfinite().values())
-        worker.trace_tile(Tile(x, y, columns, rows, sample, 1))
-        return sum(worker.nonfinite().values()) > before
-
-    columns = min(width, worker.capacity)
-    rows = max(1, worker.capacity // columns)
     for sample in range(first_sample, first_sample + sample_count):
-        for y in range(0, height, rows):
-            for x in range(0, width, columns):
-                w, h = min(columns, width - x), min(rows, height - y)
-                if not found(x, y, w, h, sample):
-                    continue
-                while h > 1:  # the upper half, or else the lower
-                    upper = h // 2
-                    y, h = (y, upper) if found(x, y, w, upper, sample) else (y + upper, h - upper)
-                while w > 1:
-                    left = w // 2
-                    x, w = (x, left) if found(x, y, left, 1, sample) else (x + left, w - left)
-                stages = TraceWorker(renderer).trace(x, y, sample).left_out
-                return NonFiniteError(stages[0], x, y, sample, renderer.seed)
+
+        def found(x: int, y: int, width: int, height: int, sample=sample) -> bool:
+            before = sum(worker.nonfinite().values())
+            worker.trace_tile(Tile(x, y, width, height, sample, 1))
+            return sum(worker.nonfinite().values()) > before
+
+        pixel = first_pixel(found, renderer.film.width, renderer.film.height, worker.capacity)
+        if pixel is not None:
+            stages = TraceWorker(renderer).trace(*pixel, sample).left_out
+            return NonFiniteError(stages[0], *pixel, sample, renderer.seed)
     raise AssertionError("a contribution that is not finite was counted, but no path makes one")
+
+
+def first_pixel(
+    found: Callable[[int, int, int, int], bool], width: int, height: int, capacity: int
+) -> tuple[int, int] | None:
+    """The first pixel, row by row, that `found` finds: in bands from the top, and then by halves.
+
+    Args:
+        found: Whether there is one in the rectangle (x, y, width, height), of at most `capacity` pixels.
+        width, height: Of the film.
+        capacity: Pixels.
+
+    Returns:
+        Its x and y; None if there is none.
+    """
+    columns = min(width, capacity)
+    rows = max(1, capacity // columns)
+    for top in range(0, height, rows):
+        for left in range(0, width, columns):
+            x, y, w, h = left, top, min(columns, width - left), min(rows, height - top)
+            if not found(x, y, w, h):
+                continue
+            while h > 1:  # the upper half, or else the lower
+                upper = h // 2
+                y, h = (y, upper) if found(x, y, w, upper) else (y + upper, h - upper)
+            while w > 1:
+                half = w // 2
+                x, w = (x, half) if found(x, y, half, 1) else (x + half, w - half)
+            return x, y
+    return None
