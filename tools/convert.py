@@ -12,7 +12,8 @@ import os
 import secrets
 import shutil
 import sys
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from wavefront.errors import SceneError, WavefrontError
@@ -21,8 +22,12 @@ from wavefront.scene.images import replacing
 from wavefront.scene.lookup import walk
 
 
-def convert(scene: description.Scene, out: str | os.PathLike) -> None:
+def convert(
+    scene: description.Scene, out: str | os.PathLike, warn: Callable[[str], object] = lambda message: None
+) -> None:
     """Writes `scene` (file paths absolute) as JSON with its meshes and textures beside it. `scene` is not changed.
+
+    `warn` is called with a line of text for each thing that a mesh loses.
 
     Raises:
         WavefrontError: A mesh or texture is missing or not readable, or the output cannot be written.
@@ -33,7 +38,7 @@ def convert(scene: description.Scene, out: str | os.PathLike) -> None:
     staged = {kind: out.parent / f".{name}.{mark}.tmp" for kind, name in names.items()}
     scene = json_format.checked(scene)  # a copy
     try:
-        _write_meshes(scene, staged["meshes"], out.parent / names["meshes"])
+        _write_meshes(scene, staged["meshes"], out.parent / names["meshes"], warn)
         _copy_textures(scene, staged["textures"], out.parent / names["textures"])
         with replacing(out) as temporary:
             temporary.write_text(json_format.dumps(scene, out.parent), encoding="utf-8")
@@ -47,7 +52,7 @@ def convert(scene: description.Scene, out: str | os.PathLike) -> None:
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def _write_meshes(scene, folder, final):
+def _write_meshes(scene, folder, final, warn):
     """Writes every mesh that comes from a file as PLY in its own space; shapes that share a file share the PLY."""
     written: dict[tuple, tuple[Path, bool]] = {}
     taken: set[str] = set()
@@ -60,6 +65,8 @@ def _write_meshes(scene, folder, final):
             name = _free_name(Path(shape.file).stem, ".ply", taken)
             plain = description.Mesh(file=shape.file, face_normals=shape.face_normals, flip_v=shape.flip_v)
             mesh = meshes.tessellate(plain, f"shapes[{i}]")
+            for note in mesh.notes:
+                warn(f"{shape.file}: {note}")
             meshes.write_ply(folder / name, mesh)
             written[key] = final / name, mesh.normals is not None
         path, has_normals = written[key]
@@ -114,6 +121,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("out", help="the JSON file to write")
     parser.add_argument("-D", dest="parameters", action="append", default=[], metavar="NAME=VALUE",
                         help="a value for $NAME in a Mitsuba scene; may be repeated")  # fmt: skip
+    parser.add_argument("--bake-emitters", action="store_true",
+                        help="let Mitsuba bake a sunsky to an environment map and a sun")  # fmt: skip
     parser.add_argument("--quiet", action="store_true", help="print no warnings")
     options = parser.parse_args(arguments)
     try:
@@ -124,11 +133,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise WavefrontError(f"-D {bad}: expected NAME=VALUE")
         parameters = dict(text.split("=", 1) for text in options.parameters)
         warn = (lambda message: None) if options.quiet else _print_warning
-        convert(load_scene(options.scene, parameters=parameters, warn=warn), options.out)
+        if options.bake_emitters:
+            _convert_baked(options, parameters, warn)
+        else:
+            convert(load_scene(options.scene, parameters=parameters, warn=warn), options.out, warn)
     except WavefrontError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 0
+
+
+def _convert_baked(options, parameters, warn):
+    from tools import bake  # only here: needs Mitsuba
+
+    if Path(options.scene).suffix.lower() != ".xml":
+        raise WavefrontError(f"{options.scene}: --bake-emitters needs a Mitsuba scene")
+    # which of our skies would be used does not matter
+    scene = load_scene(
+        options.scene, parameters=parameters, warn=lambda text: None if "--bake-emitters" in text else warn(text)
+    )
+    with tempfile.TemporaryDirectory(prefix="wavefront-bake-") as folder:
+        baked = bake.bake_sunsky(options.scene, folder, parameters)
+        convert(bake.replace_records(scene, baked), options.out, warn)
 
 
 def _print_warning(message):
