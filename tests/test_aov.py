@@ -21,7 +21,7 @@ TURN = d.Rotate(axis=(0.0, 0.0, 1.0), angle=90.0)
 
 
 def room(aovs, crop=None):
-    """A masked square with smooth normals that cuts a ball, before a void; BSDFs by name and in place."""
+    """A masked square with smooth normals that cuts a ball, under a sky; BSDFs by name and in place."""
     corners = [(-2.0, -1.5, 0.0), (2.0, -1.5, 0.0), (2.0, 1.5, 0.0), (-2.0, 1.5, 0.0)]
     square = d.Mesh(
         vertices=corners,
@@ -41,6 +41,7 @@ def room(aovs, crop=None):
             d.Diffuse(name="paint", reflectance=[0.7, 0.6, 0.1]),
             d.Mask(name="veil", bsdf="paint", opacity=0.25),
         ],
+        emitters=[d.Constant(radiance=[0.3, 0.4, 0.5])],
         shapes=[ball, far, square],  # a sphere before the meshes: indices are those of the list
     )
 
@@ -119,6 +120,7 @@ def test_aovs_do_not_change_the_image(renderer):
     """Nor does leaving any of them out change the others."""
     np.testing.assert_array_equal(Renderer(room([]), seed=SEED).render(SPP), renderer.film.image())
     channels = renderer.film.channels()
+    assert channels["variance.Y"].max() > 0.0 < channels["R"].min()
     for aovs in (["bsdf_index"], ["uv", "sample_count"], ["position", "variance"]):
         other = Renderer(room(aovs), seed=SEED)
         other.render(SPP)

@@ -24,11 +24,11 @@ def scenes() -> dict[str, Scene]:
     return {
         "thin-lens": _scene(
             "a thin lens that is focused on the third of five balls",
-            ThinLens(fov=34.0, aperture_radius=0.12, focus_distance=distance, to_world=view),
+            ThinLens(fov=42.0, aperture_radius=0.12, focus_distance=distance, to_world=view),
         ),
         "orthographic": _scene(
             "parallel projection, in which near and far are of one size",
-            Orthographic(width=3.6, to_world=look_at((2.0, 3.0, 4.0), (0.0, 0.4, -0.3))),
+            Orthographic(width=5.2, to_world=look_at((2.0, 3.0, 4.0), (0.0, 0.4, -0.3))),
         ),
     }
 

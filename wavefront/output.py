@@ -154,7 +154,6 @@ def describe_render(renderer: Renderer, source: str, started: float) -> dict:
         "bytes_per_pixel": renderer.bytes_per_pixel,
         "bytes_per_path": renderer.bytes_per_path,
         "paths_in_flight": renderer.capacity * renderer.threads,
-        "peak_memory_bytes": peak_memory_bytes(),
         "warnings": renderer.warnings,
     }
 
@@ -206,6 +205,7 @@ def write_outputs(exr: Path, renderer: Renderer, exposure: float, account: dict)
         overflow = error
         write_film(exr, renderer, False)
     write_picture(png, renderer.film, exposure)
+    account["peak_memory_bytes"] = peak_memory_bytes()  # with what writing took
     with replacing(account_path) as temporary:
         temporary.write_text(json.dumps(account, indent=2) + "\n", encoding="utf-8")
     if overflow is not None:

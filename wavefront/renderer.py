@@ -72,6 +72,11 @@ def resolve_device(device: str) -> str:
 
 def peak_memory_bytes() -> int:
     """Largest resident size of this process so far, as the operating system counts it."""
+    try:  # getrusage may give that of the process which started this one
+        with open("/proc/self/status", encoding="ascii") as file:
+            return next(int(line.split()[1]) * 1024 for line in file if line.startswith("VmHWM:"))
+    except (OSError, StopIteration):
+        pass
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
 
@@ -145,10 +150,10 @@ class Renderer:
         window, aovs = film.window, tuple(film.aovs)
         self.bytes_per_pixel = Film.bytes_per_pixel(aovs)
         self.bytes_per_path = state_bytes_per_slot(self.features)
-        held = 0
+        pixels, held = window.width * window.height, 0
         if whole_process and self.device == "cpu":
-            held = resident_bytes() + output_bytes(aovs)
-        self.capacity = self._plan_capacity(memory, held, window.width * window.height)
+            held = max(resident_bytes() + output_bytes(aovs), peak_memory_bytes() - pixels * self.bytes_per_pixel)
+        self.capacity = self._plan_capacity(memory, held, pixels)
         self.film = Film(window.width, window.height, aovs, self.device, bsdf_of_shape(scene))
         self.workers = [
             Worker(
