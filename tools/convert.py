@@ -54,16 +54,18 @@ def _write_meshes(scene, folder, final):
     for i, shape in enumerate(scene.shapes):
         if not isinstance(shape, description.Mesh) or shape.file is None:
             continue
-        key = (shape.file, shape.face_normals, shape.flip_v)
+        key = (shape.file, repr(shape.part), shape.face_normals, shape.flip_v)
         if key not in written:
             folder.mkdir(exist_ok=True)
             name = _free_name(Path(shape.file).stem, ".ply", taken)
-            plain = description.Mesh(file=shape.file, face_normals=shape.face_normals, flip_v=shape.flip_v)
+            plain = description.Mesh(
+                file=shape.file, part=shape.part, face_normals=shape.face_normals, flip_v=shape.flip_v
+            )
             mesh = meshes.tessellate(plain, f"shapes[{i}]")
             meshes.write_ply(folder / name, mesh)
             written[key] = final / name, mesh.normals is not None
         path, has_normals = written[key]
-        shape.file, shape.flip_v = str(path), None
+        shape.file, shape.part, shape.flip_v = str(path), None, None
         # computed normals stay with the reader: they depend on to_world, under which angles change
         shape.smooth_normals = shape.smooth_normals and not has_normals
 

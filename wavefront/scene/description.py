@@ -383,11 +383,22 @@ class Shape(Record):
     flip_normals: bool = False
 
 
+class GltfPart(Record):
+    """One primitive of a glTF file, in the space of its mesh."""
+
+    mesh: Annotated[int, Meta(ge=0, description="Index of the mesh in the file.")]
+    primitive: Annotated[int, Meta(ge=0, description="Index of the primitive in the mesh.")] = 0
+    uv_set: Annotated[int, Meta(ge=0, le=1, description="The n of the attribute TEXCOORD_n.")] = 0
+
+
 class Mesh(Shape, tag_field="type", tag="mesh"):
     """Triangles from a PLY, OBJ or glTF file, or inline. UVs and normals are per vertex."""
 
     file: Annotated[
         str | None, Meta(description="PLY, OBJ, glTF or GLB, relative to the scene file; excludes vertices and faces.")
+    ] = None
+    part: Annotated[
+        GltfPart | None, Meta(description="Of a glTF or GLB file; default: the meshes of all its nodes, as one.")
     ] = None
     vertices: list[Vec3] | None = None
     faces: list[tuple[int, int, int]] | None = None

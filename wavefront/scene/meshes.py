@@ -103,11 +103,11 @@ def clear_cache() -> None:
         mesh_files.clear_cache()
 
 
-def _read_mesh(path, where):
+def _read_mesh(path, where, part=None):
     # Imported here, since trimesh takes most of a second to import and scenes without mesh files need none of it.
     from wavefront.scene.mesh_files import read_mesh
 
-    return read_mesh(path, where)
+    return read_mesh(path, where, part)
 
 
 # --- meshes ----------------------------------------------------------------------------------------------------
@@ -133,7 +133,8 @@ def _mesh_arrays(shape, where):
             if getattr(shape, name) is not None:
                 raise SceneError(f"{name} are for inline vertices; the file has its own", path=f"{where}.{name}")
         source = f"{where}.file"
-        data = _read_mesh(shape.file, source)
+        part = shape.part and (shape.part.mesh, shape.part.primitive, shape.part.uv_set)
+        data = _read_mesh(shape.file, source, part)
         vertices, faces, normals, uvs = data.vertices, data.faces, data.normals, data.uvs
         names = dict.fromkeys(("vertices", "faces", "normals", "uvs"), source)
         where = source

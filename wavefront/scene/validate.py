@@ -14,7 +14,8 @@ from wavefront.scene.ior import CONDUCTORS, INDEX_OF_REFRACTION
 from wavefront.scene.lookup import BSDF_FIELDS, NUMBER_FIELDS, TEXTURE_FIELDS, shown, unknown_name, walk
 from wavefront.scene.transforms import to_matrix
 
-MESH_SUFFIXES = (".ply", ".obj", ".gltf", ".glb")
+GLTF_SUFFIXES = (".gltf", ".glb")
+MESH_SUFFIXES = (".ply", ".obj", *GLTF_SUFFIXES)
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".hdr")
 _REFLECTING = ("diffuse", "oren_nayar", "conductor", "rough_conductor", "plastic", "rough_plastic", "principled")
 _LARGEST = float(np.finfo(np.float32).max)
@@ -211,7 +212,11 @@ def _check_mesh(mesh, path):
         if inline:
             _fail(path, f"a mesh with a file has no {inline[0]} of its own")
         _check_file(mesh.file, MESH_SUFFIXES, "mesh", f"{path}.file")
+        if mesh.part is not None and Path(mesh.file).suffix.lower() not in GLTF_SUFFIXES:
+            _fail(f"{path}.part", f"only glTF files have parts; found {shown(mesh.file)}")
         return
+    if mesh.part is not None:
+        _fail(f"{path}.part", "only a mesh with a file has parts")
     if "vertices" not in inline or "faces" not in inline:
         _fail(
             path, f"a mesh has file, or vertices and faces; found {' and '.join(inline) if inline else 'none of them'}"
