@@ -15,6 +15,7 @@ import warp as wp
 
 from wavefront.accel.mesh_query import INFINITE, Geometry, make_intersector
 from wavefront.bsdf.dispatch import is_smooth, make_bsdf
+from wavefront.bsdf.frame import ShadingFrame
 from wavefront.bsdf.tables import KINDS as BSDF_KINDS
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.camera import Camera, camera_ray, make_camera
@@ -48,11 +49,11 @@ class Settings:
 
 
 @functools.cache
-def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool, nee: bool):
+def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool, tangents: bool, nee: bool):
     """Only what a scene lacks memory for is left out: kinds of primitive, vertex normals, UVs, tables of sampling."""
     closest_hit, occluded = make_intersector(triangles, spheres)
-    vertex_of = make_vertex(triangles, spheres, smooth, uvs)
-    eval_bsdf, sample_bsdf, _ = make_bsdf(tuple(sorted(BSDF_KINDS)), True, TEXTURES)
+    vertex_of = make_vertex(triangles, spheres, smooth, uvs, tangents)
+    eval_bsdf, sample_bsdf, _ = make_bsdf(tuple(sorted(BSDF_KINDS)), True, TEXTURES, tangents)
     sample_light, light_pdf = make_light_sampler(LIGHTS, TEXTURES)
     eval_envmap, _ = make_envmap(False, nee)
     eval_parameter = make_eval_parameter(TEXTURES)
@@ -136,13 +137,15 @@ def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool, nee
                 break
 
             wo = -direction
-            normal = vertex.shading_normal
-            facing = is_smooth(materials.materials[shape.material], wp.dot(normal, wo))
+            frame = ShadingFrame()
+            frame.normal = vertex.shading_normal
+            frame.tangent = vertex.tangent
+            facing = is_smooth(materials.materials[shape.material], wp.dot(frame.normal, wo))
             if settings.nee == 1 and facing and lights.lights.shape[0] > 0:
                 u = uniform4(seed, key, sample, segment - 1, PURPOSE_LIGHT)
                 light = sample_light(lights, geometry, textures, vertex.position, u)
                 if wp.max(light.L) > 0.0:
-                    f = eval_bsdf(materials, textures, shape.material, vertex.uv, normal, wo, light.wi)
+                    f = eval_bsdf(materials, textures, shape.material, vertex.uv, frame, wo, light.wi)
                     if wp.max(f.value) > 0.0:
                         start = spawn_origin(vertex.position, vertex.geometric_normal, vertex.offset, light.wi)
                         to_light = light.wi
@@ -156,7 +159,7 @@ def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool, nee
                             L += (w / light.pdf) * wp.cw_mul(beta, wp.cw_mul(f.value, light.L))
 
             u = uniform4(seed, key, sample, segment - 1, PURPOSE_BSDF)
-            s = sample_bsdf(materials, textures, shape.material, vertex.uv, normal, wo, wp.vec3(u[0], u[1], u[2]))
+            s = sample_bsdf(materials, textures, shape.material, vertex.uv, frame, wo, wp.vec3(u[0], u[1], u[2]))
             beta = wp.cw_mul(beta, s.weight)
             if not wp.max(beta) > 0.0:
                 break
@@ -188,7 +191,7 @@ def render_megakernel(renderer: Renderer, spp: int) -> np.ndarray:
     settings.seed = renderer.seed
     n = film.width * film.height * spp
     result = wp.zeros(n, dtype=wp.vec3, device="cpu")
-    kernel = make_megakernel(f.triangles, f.spheres, f.smooth, f.uvs, f.nee)
+    kernel = make_megakernel(f.triangles, f.spheres, f.smooth, f.uvs, f.tangents, f.nee)
     d = device_scene
     inputs = [make_camera(scene.camera, film), d.geometry, d.materials, d.textures, d.lights, settings]
     wp.launch(kernel, dim=n, inputs=inputs, outputs=[result], device="cpu")

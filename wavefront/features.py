@@ -18,6 +18,7 @@ class Features:
     spheres: bool
     smooth: bool  # some mesh has vertex normals
     uvs: bool  # some texture is looked up
+    tangents: bool  # some BSDF depends on the direction of its tangent
 
     # Materials
     bsdfs: tuple[str, ...]  # kinds, sorted
@@ -38,7 +39,7 @@ class Features:
     @property
     def transmission(self) -> bool:
         """Whether a path can cross into another medium, so that radiance scales with the index of refraction."""
-        return "dielectric" in self.bsdfs or "rough_dielectric" in self.bsdfs
+        return any(kind in self.bsdfs for kind in ("dielectric", "rough_dielectric", "principled_transmissive"))
 
     @property
     def smooth_bsdfs(self) -> bool:

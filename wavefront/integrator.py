@@ -50,6 +50,7 @@ def make_features(scene: description.Scene, device_scene: DeviceScene) -> Featur
         spheres=device_scene.sphere_count > 0,
         smooth=device_scene.smooth,
         uvs=bool(device_scene.texture_kinds),
+        tangents=device_scene.tangents,
         bsdfs=device_scene.bsdfs,
         mask=device_scene.mask,
         textures=device_scene.texture_kinds,
@@ -88,16 +89,18 @@ def make_kernels(f: Features) -> Kernels:
     """Kernels for a set of features; scenes that agree in what a stage reads share its kernel."""
     return Kernels(
         generate=make_generate(f.filter, f.transmission),
-        intersect=make_intersect(f.triangles, f.spheres, f.smooth, f.uvs, f.area_lights, bool(f.escape_lights)),
+        intersect=make_intersect(
+            f.triangles, f.spheres, f.smooth, f.uvs, f.tangents, f.area_lights, bool(f.escape_lights)
+        ),
         escaped=make_escaped(f.escape_lights, f.light_sampling) if f.escape_lights else None,
         emission=make_emission(f.lights, f.light_textures, f.light_sampling) if f.area_lights else None,
-        aov=make_aov(f.aovs, f.bsdfs, f.mask, f.textures, f.uvs) if f.aovs else None,
-        direct=make_direct(f.bsdfs, f.mask, f.textures, f.lights, f.light_textures, f.uvs)
+        aov=make_aov(f.aovs, f.bsdfs, f.mask, f.textures, f.uvs, f.tangents) if f.aovs else None,
+        direct=make_direct(f.bsdfs, f.mask, f.textures, f.lights, f.light_textures, f.uvs, f.tangents)
         if f.light_sampling
         else None,
         shadow=make_shadow(f.triangles, f.spheres) if f.light_sampling else None,
         drain=drain_rays,
-        scatter=make_scatter(f.bsdfs, f.mask, f.textures, f.uvs, f.transmission, f.roulette),
+        scatter=make_scatter(f.bsdfs, f.mask, f.textures, f.uvs, f.tangents, f.transmission, f.roulette),
         advance=advance_bounce,
         accumulate=make_accumulate(f.variance),
     )
@@ -105,9 +108,10 @@ def make_kernels(f: Features) -> Kernels:
 
 def skipped_arrays(f: Features) -> dict[type, tuple[str, ...]]:
     """Arrays of the path state that the features do without."""
+    surface_arrays = {"uv": f.uvs, "tangent": f.tangents, "light": f.area_lights}
     return {
         Paths: () if f.transmission else ("eta",),
-        Surfaces: (() if f.uvs else ("uv",)) + (() if f.area_lights else ("light",)),
+        Surfaces: tuple(name for name, used in surface_arrays.items() if not used),
         ShadowRays: () if f.light_sampling else tuple(ShadowRays.vars),
     }
 

@@ -88,6 +88,8 @@ class Surfaces:
     position: wp.array[wp.vec3]
     geometric_normal: wp.array[wp.vec3]  # on the side of the shading normal
     shading_normal: wp.array[wp.vec3]
+    tangent: wp.array[wp.vec3]  # along growing u, unit length, orthogonal to the shading normal; allocated if some BSDF
+    # depends on it
     offset: wp.array[wp.float32]  # how far along the geometric normal a ray must start, in metres
     uv: wp.array[wp.vec2]  # allocated if a texture is looked up
     material: wp.array[wp.int32]  # -1 where the ray escaped

@@ -7,6 +7,7 @@ import functools
 import warp as wp
 
 from wavefront.accel.mesh_query import Geometry, Hit
+from wavefront.warp_samples import orthonormal_basis
 
 # Roundings in an interpolated position and in a ray-triangle test, in units of float32's 2^-24: a handful each (Higham
 # 2002, section 3.1), doubled to be safe.
@@ -22,6 +23,7 @@ class Vertex:
     shading_normal: wp.vec3
     offset: wp.float32
     uv: wp.vec2
+    tangent: wp.vec3  # unit length, along growing u
 
 
 @wp.func
@@ -65,8 +67,34 @@ def sphere_uv(normal: wp.vec3) -> wp.vec2:
     return wp.vec2(wp.where(u < 0.0, u + 1.0, u), wp.acos(wp.clamp(normal[2], -1.0, 1.0)) / wp.pi)
 
 
+@wp.func
+def triangle_dp_du(v0: wp.vec3, v1: wp.vec3, v2: wp.vec3, uv0: wp.vec2, uv1: wp.vec2, uv2: wp.vec2) -> wp.vec3:
+    """Direction in which u grows and v does not, of any length; without UVs to tell it, that of the first edge."""
+    scale = 1.0 / triangle_extent(v0, v1, v2)
+    e1 = (v1 - v0) * scale
+    e2 = (v2 - v0) * scale
+    d1 = uv1 - uv0
+    d2 = uv2 - uv0
+    det = d1[0] * d2[1] - d1[1] * d2[0]
+    if det == 0.0 or not wp.isfinite(det):
+        return e1
+    return wp.sign(det) * (d2[1] * e1 - d1[1] * e2)
+
+
+@wp.func
+def tangent_along(normal: wp.vec3, dp_du: wp.vec3) -> wp.vec3:
+    """Unit tangent along `dp_du`, or any where that is zero or along the normal."""
+    s = dp_du - wp.dot(normal, dp_du) * normal
+    length = wp.length(s)
+    # What is left of a vector along the normal is rounding.
+    if length > 1.0e-5 * wp.length(dp_du):
+        return s / length
+    s, _t = orthonormal_basis(normal)
+    return s
+
+
 @functools.cache
-def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
+def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool, tangents: bool):
     """`make_vertex(geometry, origin, direction, hit) -> Vertex` for a hit that exists.
 
     Args:
@@ -74,6 +102,7 @@ def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
         spheres: The scene has spheres.
         smooth: Some mesh has vertex normals.
         uvs: Some texture is looked up.
+        tangents: Some BSDF depends on the direction of its tangent.
     """
 
     @wp.func
@@ -102,6 +131,9 @@ def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
                 vertex.offset = position_error(v0, v1, v2, hit.u, hit.v, normal)
                 if wp.static(uvs):
                     vertex.uv = hit.u * geometry.uvs[i0] + hit.v * geometry.uvs[i1] + b2 * geometry.uvs[i2]
+                if wp.static(tangents):
+                    dp_du = triangle_dp_du(v0, v1, v2, geometry.uvs[i0], geometry.uvs[i1], geometry.uvs[i2])
+                    vertex.tangent = tangent_along(vertex.shading_normal, dp_du)
         if wp.static(spheres):
             if hit.primitive >= geometry.triangle_count:
                 index = hit.primitive - geometry.triangle_count
@@ -117,6 +149,11 @@ def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
                 vertex.offset = SPHERE_ERROR * (wp.dot(wp.abs(center), wp.abs(outwards)) + sphere[3])
                 if wp.static(uvs):
                     vertex.uv = sphere_uv(geometry.sphere_to_local[index] * outwards)
+                if wp.static(tangents):
+                    to_local = geometry.sphere_to_local[index]
+                    local = to_local * outwards
+                    dp_du = wp.transpose(to_local) * wp.vec3(-local[1], local[0], 0.0)
+                    vertex.tangent = tangent_along(vertex.shading_normal, dp_du)
         return vertex
 
     return vertex_of

@@ -25,6 +25,7 @@ from wavefront.bsdf.microfacet import (
 from wavefront.bsdf.null import sample_null
 from wavefront.bsdf.oren_nayar import eval_oren_nayar, sample_oren_nayar
 from wavefront.bsdf.plastic import eval_plastic, sample_plastic
+from wavefront.bsdf.principled import PrincipledParameters, make_principled
 from wavefront.bsdf.record import BsdfEval, BsdfSample
 from wavefront.bsdf.rough_conductor import eval_rough_conductor, sample_rough_conductor
 from wavefront.bsdf.rough_dielectric import eval_rough_dielectric, sample_rough_dielectric
@@ -47,12 +48,17 @@ class Parameters:
     eta: wp.vec3
     k: wp.vec3
     ior: float
-    alpha: float
+    alpha: wp.vec2
     distribution: int
     diffuse: wp.vec3
     internal: float
     nonlinear: int
     table: wp.array[wp.float32]
+    principled: PrincipledParameters
+
+
+eval_principled, sample_principled = make_principled(True)
+eval_opaque, sample_opaque = make_principled(False)
 
 
 @wp.func
@@ -92,12 +98,12 @@ def call_sample_null(p: Parameters, wo: wp.vec3, u: wp.vec3):
 
 @wp.func
 def call_sample_oren_nayar(p: Parameters, wo: wp.vec3, u: wp.vec3):
-    return sample_oren_nayar(p.reflectance, p.alpha, wo, u)
+    return sample_oren_nayar(p.reflectance, p.alpha[0], wo, u)
 
 
 @wp.func
 def call_eval_oren_nayar(p: Parameters, wo: wp.vec3, wi: wp.vec3):
-    return eval_oren_nayar(p.reflectance, p.alpha, wo, wi)
+    return eval_oren_nayar(p.reflectance, p.alpha[0], wo, wi)
 
 
 @wp.func
@@ -137,6 +143,26 @@ def call_eval_rough_conductor(p: Parameters, wo: wp.vec3, wi: wp.vec3):
 @wp.func
 def call_eval_rough_dielectric(p: Parameters, wo: wp.vec3, wi: wp.vec3):
     return eval_rough_dielectric(p.ior, p.reflectance, p.transmittance, p.alpha, p.distribution, wo, wi)
+
+
+@wp.func
+def call_sample_principled(p: Parameters, wo: wp.vec3, u: wp.vec3):
+    return sample_principled(p.principled, wo, u)
+
+
+@wp.func
+def call_sample_opaque(p: Parameters, wo: wp.vec3, u: wp.vec3):
+    return sample_opaque(p.principled, wo, u)
+
+
+@wp.func
+def call_eval_principled(p: Parameters, wo: wp.vec3, wi: wp.vec3):
+    return eval_principled(p.principled, wo, wi)
+
+
+@wp.func
+def call_eval_opaque(p: Parameters, wo: wp.vec3, wi: wp.vec3):
+    return eval_opaque(p.principled, wo, wi)
 
 
 def _sample_kernel(function):
@@ -180,6 +206,8 @@ _SAMPLE_KERNELS = {
     "oren_nayar": _sample_kernel(call_sample_oren_nayar),
     "plastic": _sample_kernel(call_sample_plastic),
     "rough_plastic": _sample_kernel(call_sample_rough_plastic),
+    "principled": _sample_kernel(call_sample_opaque),
+    "principled_transmissive": _sample_kernel(call_sample_principled),
 }
 _EVAL_KERNELS = {
     "diffuse": _eval_kernel(call_eval_diffuse),
@@ -188,6 +216,8 @@ _EVAL_KERNELS = {
     "oren_nayar": _eval_kernel(call_eval_oren_nayar),
     "plastic": _eval_kernel(call_eval_plastic),
     "rough_plastic": _eval_kernel(call_eval_rough_plastic),
+    "principled": _eval_kernel(call_eval_opaque),
+    "principled_transmissive": _eval_kernel(call_eval_principled),
 }
 
 
@@ -195,7 +225,7 @@ _EVAL_KERNELS = {
 def _normals_kernel(
     wo: wp.array(dtype=wp.vec3),
     u: wp.array(dtype=wp.vec3),
-    alpha: float,
+    alpha: wp.vec2,
     distribution: int,
     # outputs
     m: wp.array(dtype=wp.vec3),
@@ -208,7 +238,7 @@ def _normals_kernel(
 def _terms_kernel(
     wo: wp.array(dtype=wp.vec3),
     m: wp.array(dtype=wp.vec3),
-    alpha: float,
+    alpha: wp.vec2,
     distribution: int,
     # outputs
     terms: wp.array(dtype=wp.vec3),
@@ -237,6 +267,13 @@ def _fresnel_kernel(
     conductor[i] = fresnel_conductor(cos_i[i], eta, k)
 
 
+PRINCIPLED = {
+    "base_color": (0.5, 0.5, 0.5), "roughness": 0.5, "anisotropic": 0.0, "metallic": 0.0, "spec_trans": 0.0,
+    "eta": 1.5, "spec_tint": 0.0, "sheen": 0.0, "sheen_tint": 0.0, "flatness": 0.0, "clearcoat": 0.0,
+    "clearcoat_gloss": 0.0, "specular_rate": 1.0, "clearcoat_rate": 1.0, "diffuse_rate": 1.0,
+}  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Sample:
     wi: np.ndarray
@@ -262,19 +299,25 @@ def parameters(
     diffuse=(1.0, 1.0, 1.0),
     nonlinear=False,
     coating="smooth",
+    principled=None,
 ) -> Parameters:
-    """White by default: a perfect mirror, or a boundary that absorbs nothing."""
+    """White by default: a perfect mirror, or a boundary that absorbs nothing.
+
+    `principled` holds fields of `PrincipledParameters`, as Mitsuba's defaults where they are not given.
+    """
     p = Parameters()
     p.reflectance = wp.vec3(*reflectance)
     p.transmittance = wp.vec3(*transmittance)
     p.eta = wp.vec3(*eta)
     p.k = wp.vec3(*k)
     p.ior = float(ior)
-    p.alpha = float(alpha)
+    p.alpha = pair(alpha)
     p.distribution = int(distribution)
     p.diffuse = wp.vec3(*diffuse)
     p.nonlinear = int(nonlinear)
     p.internal = diffuse_fresnel(1.0 / float(ior))
+    for name, value in (PRINCIPLED | (principled or {})).items():
+        setattr(p.principled, name, wp.vec3(*value) if name == "base_color" else float(value))
     if coating == "rough":
         table, p.internal = rough_coating(float(ior), float(alpha), int(distribution))
         p.table = wp.array(table, dtype=wp.float32, device=DEVICE)
@@ -310,19 +353,24 @@ def evaluate(name: str, p: Parameters, wo, wi) -> Eval:
     return Eval(e["value"], e["pdf"])
 
 
-def visible_normals(wo, alpha: float, distribution: int, u) -> np.ndarray:
+def pair(alpha) -> wp.vec2:
+    """Roughness along x and y, from one number or two."""
+    return wp.vec2(*np.broadcast_to(alpha, 2).astype(float))
+
+
+def visible_normals(wo, alpha, distribution: int, u) -> np.ndarray:
     n = len(u)
     m = wp.empty(n, dtype=wp.vec3, device=DEVICE)
-    inputs = [_in(vectors(wo, n)), _in(vectors(u, n)), alpha, distribution]
+    inputs = [_in(vectors(wo, n)), _in(vectors(u, n)), pair(alpha), distribution]
     wp.launch(_normals_kernel, dim=n, inputs=inputs, outputs=[m], device=DEVICE)
     return m.numpy()
 
 
-def microfacet_terms(wo, m, alpha: float, distribution: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def microfacet_terms(wo, m, alpha, distribution: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """D(m), G1(wo), and the density of the visible normal m."""
     n = max(len(np.atleast_2d(wo)), len(np.atleast_2d(m)))
     terms = wp.empty(n, dtype=wp.vec3, device=DEVICE)
-    inputs = [_in(vectors(wo, n)), _in(vectors(m, n)), alpha, distribution]
+    inputs = [_in(vectors(wo, n)), _in(vectors(m, n)), pair(alpha), distribution]
     wp.launch(_terms_kernel, dim=n, inputs=inputs, outputs=[terms], device=DEVICE)
     d, g1, pdf = terms.numpy().T
     return d, g1, pdf

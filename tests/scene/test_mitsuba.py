@@ -209,7 +209,7 @@ BSDFS = [
     ('<bsdf type="conductor"><string name="material" value="none"/></bsdf>', d.Conductor(eta=0.0, k=1.0)),
     ('<bsdf type="conductor"><string name="material" value="Au"/></bsdf>', d.Conductor(material="Au")),
     ('<bsdf type="conductor"><float name="eta" value="1.5"/></bsdf>', d.Conductor(eta=1.5, k=1.0)),
-    ('<bsdf type="roughconductor"/>', d.RoughConductor(eta=0.0, k=1.0, alpha=0.1, distribution="beckmann")),
+    ('<bsdf type="roughconductor"/>', d.RoughConductor(eta=0.0, k=1.0, distribution="beckmann")),
     (
         '<bsdf type="roughconductor"><float name="alpha" value="0.00001"/><string name="material" value="Cu"/></bsdf>',
         d.Conductor(material="Cu"),

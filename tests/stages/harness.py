@@ -148,7 +148,7 @@ def materials(diffuse=(), conductor=(), dielectric=()) -> bsdf.MaterialTables:
     glass = bsdf.KINDS["dielectric"]
     rows += [{"front": glass, "front_index": i, "back": glass, "back_index": i} for i in range(len(dielectric))]
     tables.materials = records(bsdf.Material, [{"opacity": 1.0, "opacity_texture": -1} | row for row in rows])
-    parameters = ("reflectance", "transmittance", "eta", "k", "alpha")
+    parameters = ("reflectance", "transmittance", "eta", "k", "alpha_u", "alpha_v")
     none = {f"{name}_texture": -1 for name in parameters}
 
     def with_defaults(struct, rows):

@@ -8,7 +8,7 @@ import numpy as np
 
 from wavefront.errors import WavefrontError
 from wavefront.scene import description
-from wavefront.scene.lookup import resolve_bsdf, resolve_texture
+from wavefront.scene.lookup import resolve_bsdf, resolve_texture, roughness
 from wavefront.scene.meshes import tessellate, write_ply
 from wavefront.scene.transforms import is_mirror, to_matrix
 
@@ -164,12 +164,16 @@ class _Writer:
             return result
         if isinstance(bsdf, description.OrenNayar):
             raise WavefrontError("Mitsuba 3 has no oren_nayar BSDF")
+        if isinstance(bsdf, description.Principled):
+            return self._principled(bsdf)
         if isinstance(bsdf, description.Null):
             return {"type": "null"}
         rough = isinstance(bsdf, (description.RoughConductor, description.RoughDielectric))
         result = {"specular_reflectance": self._parameter(bsdf.specular_reflectance)}
         if rough:
-            result |= {"distribution": bsdf.distribution, "alpha": self._parameter(bsdf.alpha, scalar=True)}
+            result["distribution"] = bsdf.distribution
+            for key, (_, value) in zip(("alpha_u", "alpha_v"), roughness(bsdf), strict=True):
+                result[key] = self._parameter(value, scalar=True)
         if isinstance(bsdf, (description.Conductor, description.RoughConductor)):
             result["type"] = "roughconductor" if rough else "conductor"
             if bsdf.material is not None:
@@ -183,6 +187,14 @@ class _Writer:
             "ext_ior": bsdf.ext_ior,
             "specular_transmittance": self._parameter(bsdf.specular_transmittance),
         }
+
+    def _principled(self, bsdf):
+        result = {"type": "principled", "base_color": self._parameter(bsdf.base_color)}
+        for name in bsdf.__struct_fields__:
+            value = getattr(bsdf, name)
+            if name not in ("name", "base_color") and value is not None:
+                result[name] = self._parameter(value, scalar=True)
+        return result
 
     def _parameter(self, value, scalar=False):
         value = resolve_texture(self.scene, value)

@@ -33,9 +33,9 @@ class Geometry:
     points: wp.array[wp.vec3]
     indices: wp.array[wp.int32]
     normals: wp.array[wp.vec3]  # per vertex; empty if no mesh has any
-    uvs: wp.array[wp.vec2]  # per vertex; empty if no texture is looked up
+    uvs: wp.array[wp.vec2]  # per vertex; empty if neither a texture nor a tangent needs it
     spheres: wp.array[wp.vec4]  # centre and radius
-    sphere_to_local: wp.array[wp.mat33]  # world normals to the sphere's own axes; empty if no texture is looked up
+    sphere_to_local: wp.array[wp.mat33]  # world normals to the sphere's own axes; empty as `uvs`
     shape_of: wp.array[wp.int32]  # shape of each primitive
     shapes: wp.array[Shape]
 

@@ -34,7 +34,7 @@ def diffuse_fresnel(eta: float) -> float:
 @wp.kernel(enable_backward=False, module="unique")
 def _integrate_coating(
     eta: float,
-    alpha: float,
+    alpha: wp.vec2,
     distribution: int,
     nodes: int,
     # out
@@ -77,7 +77,7 @@ def rough_coating(eta: float, alpha: float, distribution: int) -> tuple[np.ndarr
     wp.launch(
         _integrate_coating,
         dim=int(TABLE_SIZE),
-        inputs=[eta, alpha, distribution, _NODES],
+        inputs=[eta, wp.vec2(alpha), distribution, _NODES],
         outputs=out,
         device="cpu",
     )

@@ -6,6 +6,7 @@ import functools
 
 import warp as wp
 
+from wavefront.bsdf.frame import ShadingFrame, make_frame
 from wavefront.bsdf.kinds import make_eval_scalar, make_kinds
 from wavefront.bsdf.record import BsdfEval, BsdfSample
 from wavefront.bsdf.tables import (
@@ -13,13 +14,14 @@ from wavefront.bsdf.tables import (
     KIND_DIELECTRIC,
     KIND_NONE,
     KIND_NULL,
+    KIND_PRINCIPLED_TRANSMISSIVE,
     KIND_ROUGH_DIELECTRIC,
     KIND_THIN_DIELECTRIC,
     Material,
     MaterialTables,
 )
 from wavefront.texture import TextureTables
-from wavefront.warp_samples import orthonormal_basis, to_local, to_world
+from wavefront.warp_samples import to_local, to_world
 
 
 @wp.func
@@ -29,7 +31,7 @@ def is_delta_transmission(kind: int) -> bool:
 
 @wp.func
 def transmits(kind: int) -> bool:
-    return is_delta_transmission(kind) or kind == KIND_ROUGH_DIELECTRIC
+    return is_delta_transmission(kind) or kind == KIND_ROUGH_DIELECTRIC or kind == KIND_PRINCIPLED_TRANSMISSIVE
 
 
 @wp.func
@@ -45,21 +47,23 @@ def is_smooth(material: Material, cos_o: float) -> bool:
 
 
 @functools.cache
-def make_bsdf(kinds: tuple[str, ...], mask: bool, textures: tuple[str, ...]):
+def make_bsdf(kinds: tuple[str, ...], mask: bool, textures: tuple[str, ...], tangents: bool):
     """BSDF functions for the kinds in a scene.
 
     Args:
         kinds: Names of the kinds, from `tables.KINDS`.
         mask: Whether some material is not opaque.
         textures: Kinds of texture that parameters may have, see `texture.make_eval_texture`.
+        tangents: Whether frames have a tangent.
 
     Returns:
-        `eval_bsdf(tables, textures, material, uv, normal, wo, wi) -> BsdfEval` without the delta parts,
-        `sample_bsdf(tables, textures, material, uv, normal, wo, u) -> BsdfSample`, both with directions in world
+        `eval_bsdf(tables, textures, material, uv, frame, wo, wi) -> BsdfEval` without the delta parts,
+        `sample_bsdf(tables, textures, material, uv, frame, wo, u) -> BsdfSample`, both with directions in world
         space, and `eval_albedo(tables, textures, material, uv, normal, wo) -> vec3`, a colour for denoisers.
     """
     eval_local, sample_local, albedo_local = make_kinds(kinds, textures)
     eval_scalar = make_eval_scalar(textures)
+    _, basis = make_frame(tangents)
 
     @wp.func
     def opacity_at(textures: TextureTables, material: Material, uv: wp.vec2) -> float:
@@ -78,13 +82,13 @@ def make_bsdf(kinds: tuple[str, ...], mask: bool, textures: tuple[str, ...]):
         textures: TextureTables,
         material_index: int,
         uv: wp.vec2,
-        normal: wp.vec3,
+        frame: ShadingFrame,
         wo: wp.vec3,
         wi: wp.vec3,
     ) -> BsdfEval:
         material = tables.materials[material_index]
-        s, t = orthonormal_basis(normal)
-        wo_local = to_local(s, t, normal, wo)
+        s, t = basis(frame)
+        wo_local = to_local(s, t, frame.normal, wo)
         cos_o = wo_local[2]
         kind = side_kind(material, cos_o)
         index = wp.where(cos_o >= 0.0, material.front_index, material.back_index)
@@ -95,7 +99,7 @@ def make_bsdf(kinds: tuple[str, ...], mask: bool, textures: tuple[str, ...]):
             index,
             uv,
             mirror_side(kind, wo_local, cos_o),
-            mirror_side(kind, to_local(s, t, normal, wi), cos_o),
+            mirror_side(kind, to_local(s, t, frame.normal, wi), cos_o),
         )
         if wp.static(mask):
             opacity = opacity_at(textures, material, uv)
@@ -109,7 +113,7 @@ def make_bsdf(kinds: tuple[str, ...], mask: bool, textures: tuple[str, ...]):
         textures: TextureTables,
         material_index: int,
         uv: wp.vec2,
-        normal: wp.vec3,
+        frame: ShadingFrame,
         wo: wp.vec3,
         u: wp.vec3,
     ) -> BsdfSample:
@@ -124,15 +128,15 @@ def make_bsdf(kinds: tuple[str, ...], mask: bool, textures: tuple[str, ...]):
                 through.eta = 1.0
                 return through
             u_lobe = wp.min(u_lobe / opacity, 1.0 - 5.9604645e-8)  # what is left of the number chooses the lobe
-        s, t = orthonormal_basis(normal)
-        wo_local = to_local(s, t, normal, wo)
+        s, t = basis(frame)
+        wo_local = to_local(s, t, frame.normal, wo)
         cos_o = wo_local[2]
         kind = side_kind(material, cos_o)
         index = wp.where(cos_o >= 0.0, material.front_index, material.back_index)
         result = sample_local(
             tables, textures, kind, index, uv, mirror_side(kind, wo_local, cos_o), wp.vec3(u[0], u[1], u_lobe)
         )
-        result.wi = to_world(s, t, normal, mirror_side(kind, result.wi, cos_o))
+        result.wi = to_world(s, t, frame.normal, mirror_side(kind, result.wi, cos_o))
         if wp.static(mask):
             result.pdf *= opacity
         return result

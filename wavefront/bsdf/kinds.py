@@ -13,6 +13,7 @@ from wavefront.bsdf.fresnel import fresnel_conductor
 from wavefront.bsdf.null import sample_null
 from wavefront.bsdf.oren_nayar import eval_oren_nayar, sample_oren_nayar
 from wavefront.bsdf.plastic import eval_plastic, sample_plastic
+from wavefront.bsdf.principled import PrincipledParameters, make_principled
 from wavefront.bsdf.record import BsdfEval, BsdfSample
 from wavefront.bsdf.rough_conductor import eval_rough_conductor, sample_rough_conductor
 from wavefront.bsdf.rough_dielectric import eval_rough_dielectric, sample_rough_dielectric
@@ -24,11 +25,14 @@ from wavefront.bsdf.tables import (
     KIND_NULL,
     KIND_OREN_NAYAR,
     KIND_PLASTIC,
+    KIND_PRINCIPLED,
+    KIND_PRINCIPLED_TRANSMISSIVE,
     KIND_ROUGH_CONDUCTOR,
     KIND_ROUGH_DIELECTRIC,
     KIND_ROUGH_PLASTIC,
     KIND_THIN_DIELECTRIC,
     MaterialTables,
+    PrincipledRecord,
 )
 from wavefront.bsdf.thin_dielectric import sample_thin_dielectric
 from wavefront.texture import TextureTables, make_eval_parameter
@@ -56,6 +60,55 @@ def make_eval_scalar(textures: tuple[str, ...]):
 
 
 @functools.cache
+def make_eval_alpha(textures: tuple[str, ...]):
+    """`eval_alpha(tables, value, texture_u, texture_v, uv) -> vec2`: roughness along the tangent and across it."""
+    eval_scalar = make_eval_scalar(textures)
+
+    @wp.func
+    def eval_alpha(textures: TextureTables, value: wp.vec2, texture_u: int, texture_v: int, uv: wp.vec2) -> wp.vec2:
+        u = clamp_alpha(eval_scalar(textures, value[0], texture_u, uv))
+        v = u
+        if value[1] != value[0] or texture_v != texture_u:
+            v = clamp_alpha(eval_scalar(textures, value[1], texture_v, uv))
+        return wp.vec2(u, v)
+
+    return eval_alpha
+
+
+@functools.cache
+def make_principled_at(textures: tuple[str, ...]):
+    """`principled_at(record, tables, uv) -> PrincipledParameters`: what a principled material is at one point."""
+    eval_parameter = make_eval_parameter(textures)
+    eval_scalar = make_eval_scalar(textures)
+
+    @wp.func
+    def fraction(textures: TextureTables, value: float, texture: int, uv: wp.vec2) -> float:
+        return wp.clamp(eval_scalar(textures, value, texture, uv), 0.0, 1.0)
+
+    @wp.func
+    def principled_at(r: PrincipledRecord, textures: TextureTables, uv: wp.vec2) -> PrincipledParameters:
+        p = PrincipledParameters()
+        p.base_color = eval_parameter(textures, r.base_color, r.base_color_texture, uv)
+        p.roughness = fraction(textures, r.roughness, r.roughness_texture, uv)
+        p.anisotropic = fraction(textures, r.anisotropic, r.anisotropic_texture, uv)
+        p.metallic = fraction(textures, r.metallic, r.metallic_texture, uv)
+        p.spec_trans = fraction(textures, r.spec_trans, r.spec_trans_texture, uv)
+        p.spec_tint = fraction(textures, r.spec_tint, r.spec_tint_texture, uv)
+        p.sheen = fraction(textures, r.sheen, r.sheen_texture, uv)
+        p.sheen_tint = fraction(textures, r.sheen_tint, r.sheen_tint_texture, uv)
+        p.flatness = fraction(textures, r.flatness, r.flatness_texture, uv)
+        p.clearcoat = fraction(textures, r.clearcoat, r.clearcoat_texture, uv)
+        p.clearcoat_gloss = fraction(textures, r.clearcoat_gloss, r.clearcoat_gloss_texture, uv)
+        p.eta = r.eta
+        p.specular_rate = r.specular_rate
+        p.clearcoat_rate = r.clearcoat_rate
+        p.diffuse_rate = r.diffuse_rate
+        return p
+
+    return principled_at
+
+
+@functools.cache
 def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
     """BSDFs in their local frame, by kind and index of the record.
 
@@ -78,8 +131,14 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
     has_thin_dielectric = "thin_dielectric" in kinds
     has_null = "null" in kinds
     has_oren_nayar = "oren_nayar" in kinds
+    has_transmissive = "principled_transmissive" in kinds
+    has_principled = "principled" in kinds or has_transmissive
     eval_parameter = make_eval_parameter(textures)
     eval_scalar = make_eval_scalar(textures)
+    eval_alpha = make_eval_alpha(textures)
+    principled_at = make_principled_at(textures)
+    # One pair of functions for both kinds: what transmits includes what does not.
+    eval_principled, sample_principled = make_principled(has_transmissive)
 
     @wp.func
     def eval_local(
@@ -106,7 +165,7 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
                     eval_parameter(textures, c.eta, c.eta_texture, uv),
                     eval_parameter(textures, c.k, c.k_texture, uv),
                     eval_parameter(textures, c.reflectance, c.reflectance_texture, uv),
-                    clamp_alpha(eval_scalar(textures, c.alpha, c.alpha_texture, uv)),
+                    eval_alpha(textures, c.alpha, c.alpha_u_texture, c.alpha_v_texture, uv),
                     c.distribution,
                     wo,
                     wi,
@@ -118,7 +177,7 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
                     g.eta,
                     eval_parameter(textures, g.reflectance, g.reflectance_texture, uv),
                     eval_parameter(textures, g.transmittance, g.transmittance_texture, uv),
-                    clamp_alpha(eval_scalar(textures, g.alpha, g.alpha_texture, uv)),
+                    eval_alpha(textures, g.alpha, g.alpha_u_texture, g.alpha_v_texture, uv),
                     g.distribution,
                     wo,
                     wi,
@@ -144,13 +203,16 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
                     p.eta,
                     p.internal_reflectance,
                     p.nonlinear,
-                    p.alpha,
+                    wp.vec2(p.alpha),
                     p.distribution,
                     tables.coatings,
                     p.first,
                     wo,
                     wi,
                 )
+        if wp.static(has_principled):
+            if kind == KIND_PRINCIPLED or kind == KIND_PRINCIPLED_TRANSMISSIVE:
+                result = eval_principled(principled_at(tables.principled[index], textures, uv), wo, wi)
         return result
 
     @wp.func
@@ -188,7 +250,7 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
                     eval_parameter(textures, c.eta, c.eta_texture, uv),
                     eval_parameter(textures, c.k, c.k_texture, uv),
                     eval_parameter(textures, c.reflectance, c.reflectance_texture, uv),
-                    clamp_alpha(eval_scalar(textures, c.alpha, c.alpha_texture, uv)),
+                    eval_alpha(textures, c.alpha, c.alpha_u_texture, c.alpha_v_texture, uv),
                     c.distribution,
                     wo,
                     u,
@@ -210,7 +272,7 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
                     g.eta,
                     eval_parameter(textures, g.reflectance, g.reflectance_texture, uv),
                     eval_parameter(textures, g.transmittance, g.transmittance_texture, uv),
-                    clamp_alpha(eval_scalar(textures, g.alpha, g.alpha_texture, uv)),
+                    eval_alpha(textures, g.alpha, g.alpha_u_texture, g.alpha_v_texture, uv),
                     g.distribution,
                     wo,
                     u,
@@ -236,7 +298,7 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
                     p.eta,
                     p.internal_reflectance,
                     p.nonlinear,
-                    p.alpha,
+                    wp.vec2(p.alpha),
                     p.distribution,
                     tables.coatings,
                     p.first,
@@ -253,6 +315,9 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
                     wo,
                     u,
                 )
+        if wp.static(has_principled):
+            if kind == KIND_PRINCIPLED or kind == KIND_PRINCIPLED_TRANSMISSIVE:
+                result = sample_principled(principled_at(tables.principled[index], textures, uv), wo, u)
         if wp.static(has_null):
             if kind == KIND_NULL:
                 result = sample_null(wo)
@@ -286,6 +351,10 @@ def make_kinds(kinds: tuple[str, ...], textures: tuple[str, ...]):
             if kind == KIND_PLASTIC or kind == KIND_ROUGH_PLASTIC:
                 p = tables.plastic[index]
                 albedo = eval_parameter(textures, p.diffuse, p.diffuse_texture, uv)
+        if wp.static(has_principled):
+            if kind == KIND_PRINCIPLED or kind == KIND_PRINCIPLED_TRANSMISSIVE:
+                b = tables.principled[index]
+                albedo = eval_parameter(textures, b.base_color, b.base_color_texture, uv)
         if wp.static(has_null):
             if kind == KIND_NULL:
                 albedo = wp.vec3(1.0)

@@ -1,7 +1,8 @@
-"""Isotropic microfacet distributions: GGX and Beckmann with Smith's shadowing, sampled by visible normals.
+"""Microfacet distributions: GGX and Beckmann with Smith's shadowing, sampled by visible normals.
 
 Walter et al. 2007, "Microfacet Models for Refraction through Rough Surfaces"; Heitz 2014, "Understanding the
-Masking-Shadowing Function in Microfacet-Based BRDFs". `alpha` is the roughness, `m` a microfacet normal with
+Masking-Shadowing Function in Microfacet-Based BRDFs". `alpha` is the roughness along x and along y: every function
+takes the surface for one of alpha = 1 stretched by alpha (Heitz 2014, section 5.3). `m` is a microfacet normal with
 m.z > 0, and `w` a direction above the macroscopic surface (w.z > 0). All squares of sines come from x and y, never
 from 1 - z^2, which is 0 in float32 for the slopes of a lobe with alpha < 3e-4.
 """
@@ -22,24 +23,27 @@ _MAX_ITERATIONS = wp.constant(16)
 
 
 @wp.func
-def microfacet_d(m: wp.vec3, alpha: float, distribution: int) -> float:
+def microfacet_d(m: wp.vec3, alpha: wp.vec2, distribution: int) -> float:
     """Density D(m) of normals: the integral of D(m) m.z over the hemisphere is one.
 
-    GGX       D = 1 / (pi alpha^2 (z^2 + (x^2 + y^2) / alpha^2)^2)
-    Beckmann  D = exp(-tan^2(theta) / alpha^2) / (pi alpha^2 z^4)
+    With the stretched slope s^2 = (x / alpha.x)^2 + (y / alpha.y)^2
+        GGX       D = 1 / (pi alpha.x alpha.y (z^2 + s^2)^2)
+        Beckmann  D = exp(-s^2 / z^2) / (pi alpha.x alpha.y z^4)
     """
     d = 0.0
     if m[2] > 0.0:
-        inv_alpha2 = 1.0 / (alpha * alpha)
-        slope2 = (m[0] * m[0] + m[1] * m[1]) * inv_alpha2
+        inv_area = 1.0 / (alpha[0] * alpha[1])
+        x = m[0] / alpha[0]
+        y = m[1] / alpha[1]
+        slope2 = x * x + y * y
         cos2 = m[2] * m[2]
         if distribution == DISTRIBUTION_GGX:
             r = cos2 + slope2
-            d = _INV_PI * inv_alpha2 / (r * r)
+            d = _INV_PI * inv_area / (r * r)
         else:
             # At the horizon the exponential is 0 long before the floor acts, and 0 / 0 must not arise.
             cos2 = wp.max(cos2, 1.0e-12)
-            d = _INV_PI * inv_alpha2 * wp.exp(-slope2 / cos2) / (cos2 * cos2)
+            d = _INV_PI * inv_area * wp.exp(-slope2 / cos2) / (cos2 * cos2)
     return d
 
 
@@ -47,15 +51,17 @@ def microfacet_d(m: wp.vec3, alpha: float, distribution: int) -> float:
 
 
 @wp.func
-def smith_g1_over_cos(w: wp.vec3, alpha: float, distribution: int) -> float:
+def smith_g1_over_cos(w: wp.vec3, alpha: wp.vec2, distribution: int) -> float:
     """G1(w) / |w.z|: finite at grazing angles, where densities need it. The caller checks that w sees the microfacet.
 
-    With z = |w.z|, s = alpha sin(theta) and a = z / s, Smith's G1 = 1 / (1 + Lambda(a)) is
+    With z = |w.z|, s the length of (alpha.x w.x, alpha.y w.y) and a = z / s, Smith's G1 = 1 / (1 + Lambda(a)) is
         GGX       G1 = 2 z / (z + sqrt(z^2 + s^2))
         Beckmann  G1 = 2 z / (z (1 + erf(a)) + s exp(-a^2) / sqrt(pi)).
     """
     z = wp.abs(w[2])
-    s2 = alpha * alpha * (w[0] * w[0] + w[1] * w[1])
+    x = alpha[0] * w[0]
+    y = alpha[1] * w[1]
+    s2 = x * x + y * y
     denominator = 0.0
     if distribution == DISTRIBUTION_GGX:
         denominator = z + wp.sqrt(z * z + s2)
@@ -70,7 +76,7 @@ def smith_g1_over_cos(w: wp.vec3, alpha: float, distribution: int) -> float:
 
 
 @wp.func
-def smith_g1(w: wp.vec3, alpha: float, distribution: int) -> float:
+def smith_g1(w: wp.vec3, alpha: wp.vec2, distribution: int) -> float:
     """Fraction of the microfacets facing w that w sees. The caller checks that w sees the front of the microfacet."""
     return wp.min(wp.abs(w[2]) * smith_g1_over_cos(w, alpha, distribution), 1.0)
 
@@ -79,7 +85,7 @@ def smith_g1(w: wp.vec3, alpha: float, distribution: int) -> float:
 
 
 @wp.func
-def visible_normal_pdf(wo: wp.vec3, m: wp.vec3, alpha: float, distribution: int) -> float:
+def visible_normal_pdf(wo: wp.vec3, m: wp.vec3, alpha: wp.vec2, distribution: int) -> float:
     """Density of the normals seen from wo: D(m) G1(wo) max(0, wo.m) / wo.z (Heitz and d'Eon 2014), wo.z > 0."""
     return (
         microfacet_d(m, alpha, distribution) * smith_g1_over_cos(wo, alpha, distribution) * wp.max(0.0, wp.dot(wo, m))
@@ -87,7 +93,7 @@ def visible_normal_pdf(wo: wp.vec3, m: wp.vec3, alpha: float, distribution: int)
 
 
 @wp.func
-def _sample_visible_ggx(wo: wp.vec3, alpha: float, u: wp.vec2) -> wp.vec3:
+def _sample_visible_ggx(wo: wp.vec3, alpha: wp.vec2, u: wp.vec2) -> wp.vec3:
     """Dupuy and Benyoub 2023, "Sampling Visible GGX Normals with Spherical Caps".
 
     Scaling x and y by alpha turns the surface into a hemisphere, w = wo scaled and normalised. Rays along -w that
@@ -95,7 +101,7 @@ def _sample_visible_ggx(wo: wp.vec3, alpha: float, u: wp.vec2) -> wp.vec3:
     normal h = c + w. In the cap c.z = (1 - u)(1 + w.z) - w.z; written so, h.z and sin^2(c) are free of cancellation:
         h.z = (1 - u)(1 + w.z),   1 - c.z = u (1 + w.z),   1 + c.z = h.z + (1 - w.z),   1 - w.z = s^2 / (1 + w.z).
     """
-    w = wp.normalize(wp.vec3(alpha * wo[0], alpha * wo[1], wo[2]))
+    w = wp.normalize(wp.vec3(alpha[0] * wo[0], alpha[1] * wo[1], wo[2]))
     one_plus_z = 1.0 + w[2]
     one_minus_z = (w[0] * w[0] + w[1] * w[1]) / one_plus_z
     h_z = (1.0 - u[1]) * one_plus_z
@@ -103,7 +109,7 @@ def _sample_visible_ggx(wo: wp.vec3, alpha: float, u: wp.vec2) -> wp.vec3:
     phi = _TWO_PI * u[0]
     h_x = sin_c * wp.cos(phi) + w[0]
     h_y = sin_c * wp.sin(phi) + w[1]
-    return wp.normalize(wp.vec3(alpha * h_x, alpha * h_y, h_z))
+    return wp.normalize(wp.vec3(alpha[0] * h_x, alpha[1] * h_y, h_z))
 
 
 @wp.func
@@ -149,26 +155,30 @@ def visible_beckmann_slope(z: float, s: float, u: float) -> float:
 
 
 @wp.func
-def _sample_visible_beckmann(wo: wp.vec3, alpha: float, u: wp.vec2) -> wp.vec3:
+def _sample_visible_beckmann(wo: wp.vec3, alpha: wp.vec2, u: wp.vec2) -> wp.vec3:
     """Stretches the surface to alpha = 1, samples the two slopes, rotates them to wo's azimuth, and scales back.
 
     The slope across the viewing direction is an independent normal variable: its CDF is (1 + erf(y)) / 2. Numbers
     are taken at the centre of their interval of width 2^-24, since 0 would be an infinite slope.
     """
-    sin_o = wp.sqrt(wo[0] * wo[0] + wo[1] * wo[1])
+    o_x = alpha[0] * wo[0]
+    o_y = alpha[1] * wo[1]
+    s = wp.sqrt(o_x * o_x + o_y * o_y)
     cos_phi = 1.0
     sin_phi = 0.0
-    if sin_o > 0.0:
-        cos_phi = wo[0] / sin_o
-        sin_phi = wo[1] / sin_o
-    length = wp.sqrt(alpha * alpha * sin_o * sin_o + wo[2] * wo[2])
-    x = visible_beckmann_slope(wo[2] / length, alpha * sin_o / length, wp.min(u[0] + 0.5 * _STEP, 1.0 - _STEP))
+    if s > 0.0:
+        cos_phi = o_x / s
+        sin_phi = o_y / s
+    length = wp.sqrt(s * s + wo[2] * wo[2])
+    x = visible_beckmann_slope(wo[2] / length, s / length, wp.min(u[0] + 0.5 * _STEP, 1.0 - _STEP))
     y = wp.erfinv(2.0 * u[1] - 1.0 + _STEP)
-    return wp.normalize(wp.vec3(-alpha * (cos_phi * x - sin_phi * y), -alpha * (sin_phi * x + cos_phi * y), 1.0))
+    slope_x = alpha[0] * (cos_phi * x - sin_phi * y)
+    slope_y = alpha[1] * (sin_phi * x + cos_phi * y)
+    return wp.normalize(wp.vec3(-slope_x, -slope_y, 1.0))
 
 
 @wp.func
-def sample_visible_normal(wo: wp.vec3, alpha: float, distribution: int, u: wp.vec2) -> wp.vec3:
+def sample_visible_normal(wo: wp.vec3, alpha: wp.vec2, distribution: int, u: wp.vec2) -> wp.vec3:
     """A normal with density visible_normal_pdf, for wo.z > 0."""
     m = wp.vec3(0.0, 0.0, 1.0)
     if distribution == DISTRIBUTION_GGX:

@@ -1,7 +1,7 @@
 """Boundary between two dielectrics with a microfacet surface (Walter et al. 2007), both sides.
 
 eta = n_interior / n_exterior, the normal points to the exterior. Inside the functions the viewer is always above:
-for wo.z < 0 the frame is mirrored at the surface and eta replaced by 1 / eta, which changes nothing for an isotropic
+for wo.z < 0 the frame is mirrored at the surface and eta replaced by 1 / eta, which changes nothing for a microfacet
 surface. From then on eta = n_wi / n_wo for transmission.
 
 A visible normal is sampled, and reflection with probability F. With pdf_m = D G1(wo) (wo.m) / cos(wo)
@@ -25,7 +25,7 @@ def sample_rough_dielectric(
     eta: float,
     specular_reflectance: wp.vec3,
     specular_transmittance: wp.vec3,
-    alpha: float,
+    alpha: wp.vec2,
     distribution: int,
     wo: wp.vec3,
     u: wp.vec3,
@@ -72,7 +72,7 @@ def eval_rough_dielectric(
     eta: float,
     specular_reflectance: wp.vec3,
     specular_transmittance: wp.vec3,
-    alpha: float,
+    alpha: wp.vec2,
     distribution: int,
     wo: wp.vec3,
     wi: wp.vec3,

@@ -19,6 +19,8 @@ KIND_ROUGH_PLASTIC = wp.constant(7)
 KIND_THIN_DIELECTRIC = wp.constant(8)
 KIND_NULL = wp.constant(9)
 KIND_OREN_NAYAR = wp.constant(10)
+KIND_PRINCIPLED = wp.constant(11)
+KIND_PRINCIPLED_TRANSMISSIVE = wp.constant(12)
 KINDS = {
     "diffuse": 1,
     "conductor": 2,
@@ -30,8 +32,10 @@ KINDS = {
     "thin_dielectric": 8,
     "null": 9,
     "oren_nayar": 10,
+    "principled": 11,
+    "principled_transmissive": 12,
 }
-TRANSMISSIVE = ("dielectric", "rough_dielectric", "thin_dielectric", "null")
+TRANSMISSIVE = ("dielectric", "rough_dielectric", "thin_dielectric", "null", "principled_transmissive")
 DELTA = ("conductor", "dielectric", "thin_dielectric", "null")
 
 
@@ -69,8 +73,9 @@ class ConductorRecord:
     k_texture: wp.int32
     reflectance: wp.vec3
     reflectance_texture: wp.int32
-    alpha: wp.float32
-    alpha_texture: wp.int32
+    alpha: wp.vec2  # along the tangent and across it
+    alpha_u_texture: wp.int32
+    alpha_v_texture: wp.int32
     distribution: wp.int32
 
 
@@ -83,8 +88,9 @@ class DielectricRecord:
     reflectance_texture: wp.int32
     transmittance: wp.vec3
     transmittance_texture: wp.int32
-    alpha: wp.float32
-    alpha_texture: wp.int32
+    alpha: wp.vec2  # along the tangent and across it
+    alpha_u_texture: wp.int32
+    alpha_v_texture: wp.int32
     distribution: wp.int32
 
 
@@ -105,6 +111,36 @@ class PlasticRecord:
 
 
 @wp.struct
+class PrincipledRecord:
+    eta: wp.float32  # interior over exterior index of refraction
+    specular_rate: wp.float32  # of sampling
+    clearcoat_rate: wp.float32
+    diffuse_rate: wp.float32
+    base_color: wp.vec3
+    base_color_texture: wp.int32
+    roughness: wp.float32
+    roughness_texture: wp.int32
+    anisotropic: wp.float32
+    anisotropic_texture: wp.int32
+    metallic: wp.float32
+    metallic_texture: wp.int32
+    spec_trans: wp.float32
+    spec_trans_texture: wp.int32
+    spec_tint: wp.float32
+    spec_tint_texture: wp.int32
+    sheen: wp.float32
+    sheen_texture: wp.int32
+    sheen_tint: wp.float32
+    sheen_tint_texture: wp.int32
+    flatness: wp.float32
+    flatness_texture: wp.int32
+    clearcoat: wp.float32
+    clearcoat_texture: wp.int32
+    clearcoat_gloss: wp.float32
+    clearcoat_gloss_texture: wp.int32
+
+
+@wp.struct
 class MaterialTables:
     materials: wp.array[Material]
     diffuse: wp.array[DiffuseRecord]
@@ -112,4 +148,5 @@ class MaterialTables:
     dielectric: wp.array[DielectricRecord]
     plastic: wp.array[PlasticRecord]
     oren_nayar: wp.array[OrenNayarRecord]
+    principled: wp.array[PrincipledRecord]
     coatings: wp.array[wp.float32]

@@ -132,14 +132,21 @@ class Conductor(Record, tag_field="type", tag="conductor"):
 
 
 class RoughConductor(Record, tag_field="type", tag="rough_conductor"):
-    """Conductor with a microfacet surface, isotropic."""
+    """Conductor with a microfacet surface."""
 
     name: str = ""
     material: Annotated[str | None, Meta(description="Named metal; excludes eta and k.")] = None
     eta: Spectrum | None = None
     k: Spectrum | None = None
     specular_reflectance: Reflectance = 1.0
-    alpha: Annotated[Alpha, Meta(description="Microfacet roughness (root mean square slope for Beckmann).")] = 0.1
+    alpha: Annotated[
+        Alpha | None,
+        Meta(description="Microfacet roughness (root mean square slope for Beckmann); default: 0.1."),
+    ] = None
+    alpha_u: Annotated[Alpha | None, Meta(description="Roughness along growing u; with alpha_v instead of alpha.")] = (
+        None
+    )
+    alpha_v: Annotated[Alpha | None, Meta(description="Roughness across it; with alpha_u instead of alpha.")] = None
     distribution: Distribution = "ggx"
 
 
@@ -159,7 +166,7 @@ class Dielectric(Record, tag_field="type", tag="dielectric"):
 
 
 class RoughDielectric(Record, tag_field="type", tag="rough_dielectric"):
-    """Boundary between two dielectrics with a microfacet surface, isotropic."""
+    """Boundary between two dielectrics with a microfacet surface."""
 
     name: str = ""
     int_ior: Annotated[
@@ -168,7 +175,14 @@ class RoughDielectric(Record, tag_field="type", tag="rough_dielectric"):
     ext_ior: Annotated[IOR, Meta(description="Exterior index of refraction, or a name.")] = 1.000277
     specular_reflectance: Reflectance = 1.0
     specular_transmittance: Reflectance = 1.0
-    alpha: Annotated[Alpha, Meta(description="Microfacet roughness (root mean square slope for Beckmann).")] = 0.1
+    alpha: Annotated[
+        Alpha | None,
+        Meta(description="Microfacet roughness (root mean square slope for Beckmann); default: 0.1."),
+    ] = None
+    alpha_u: Annotated[Alpha | None, Meta(description="Roughness along growing u; with alpha_v instead of alpha.")] = (
+        None
+    )
+    alpha_v: Annotated[Alpha | None, Meta(description="Roughness across it; with alpha_u instead of alpha.")] = None
     distribution: Distribution = "ggx"
 
 

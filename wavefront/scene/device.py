@@ -35,6 +35,7 @@ class DeviceScene:
     smooth: bool
     bsdfs: tuple[str, ...]
     mask: bool
+    tangents: bool
     texture_kinds: tuple[str, ...]
     light_kinds: tuple[str, ...]
     light_texture_kinds: tuple[str, ...]
@@ -80,6 +81,7 @@ class _Upload:
             smooth=any(mesh.normals is not None for _, mesh, _ in meshes),
             bsdfs=tuple(sorted(self.materials.kinds)),
             mask=self.materials.mask,
+            tangents=self.materials.tangents,
             texture_kinds=tuple(sorted(set(self.atlas.kinds))),
             light_kinds=light_kinds,
             light_texture_kinds=tuple(sorted(self.light_texture_kinds)),
@@ -130,7 +132,7 @@ class _Upload:
         if any(mesh.normals is not None for _, mesh, _ in meshes):
             normals = [m.normals if m.normals is not None else np.zeros_like(m.vertices) for _, m, _ in meshes]
             geometry.normals = wp.array(np.concatenate(normals), dtype=wp.vec3, device=device)
-        if self.atlas.records:
+        if self.atlas.records or self.materials.tangents:
             if meshes:
                 uvs = [m.uvs if m.uvs is not None else np.zeros((len(m.vertices), 2)) for _, m, _ in meshes]
                 geometry.uvs = wp.array(np.concatenate(uvs), dtype=wp.vec2, device=device)

@@ -8,6 +8,19 @@ from collections.abc import Iterable, Iterator
 from wavefront.errors import SceneError
 from wavefront.scene import description
 
+# Fields of a principled BSDF that are numbers from 0 to 1, or textures.
+PRINCIPLED_FRACTIONS = (
+    "roughness",
+    "anisotropic",
+    "metallic",
+    "spec_trans",
+    "spec_tint",
+    "sheen",
+    "sheen_tint",
+    "flatness",
+    "clearcoat",
+    "clearcoat_gloss",
+)
 # Fields in which a string is the name of a texture.
 TEXTURE_FIELDS = frozenset(
     (
@@ -16,17 +29,10 @@ TEXTURE_FIELDS = frozenset(
         "specular_reflectance",
         "specular_transmittance",
         "alpha",
-        "roughness",
+        "alpha_u",
+        "alpha_v",
         "base_color",
-        "anisotropic",
-        "metallic",
-        "spec_trans",
-        "spec_tint",
-        "sheen",
-        "sheen_tint",
-        "flatness",
-        "clearcoat",
-        "clearcoat_gloss",
+        *PRINCIPLED_FRACTIONS,
         "opacity",
         "radiance",
         "eta",
@@ -78,6 +84,13 @@ def resolve_texture(scene: description.Scene, ref: object) -> object:
         SceneError: No texture of the scene has that name.
     """
     return _resolve("texture", scene.textures, ref)
+
+
+def roughness(bsdf: description.RoughConductor | description.RoughDielectric) -> tuple[tuple[str, object], ...]:
+    """Field and value of the roughness along the tangent, and the same across it."""
+    if bsdf.alpha_u is not None:
+        return ("alpha_u", bsdf.alpha_u), ("alpha_v", bsdf.alpha_v)
+    return (("alpha", 0.1 if bsdf.alpha is None else bsdf.alpha),) * 2
 
 
 def _resolve(kind, records, ref):

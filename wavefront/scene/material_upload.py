@@ -9,7 +9,7 @@ from wavefront.bsdf import tables as bsdf_tables
 from wavefront.bsdf.coating import diffuse_fresnel, rough_coating
 from wavefront.scene import description
 from wavefront.scene.ior import CONDUCTORS, INDEX_OF_REFRACTION
-from wavefront.scene.lookup import resolve_bsdf
+from wavefront.scene.lookup import PRINCIPLED_FRACTIONS, resolve_bsdf, roughness
 from wavefront.scene.texture_upload import TextureAtlas, struct_array
 
 DISTRIBUTIONS = {"ggx": 0, "beckmann": 1}
@@ -24,7 +24,26 @@ BSDF_KINDS = {
     description.Null: "null",
     description.Plastic: "plastic",
     description.RoughPlastic: "rough_plastic",
+    description.Principled: "principled",
 }
+
+
+def bsdf_kind(bsdf: description.Bsdf) -> str:
+    """Name of the kind, from `tables.KINDS`, of a BSDF that is neither two-sided nor a mask."""
+    if isinstance(bsdf, description.Principled) and bsdf.spec_trans != 0.0:  # a number, or textured
+        return "principled_transmissive"
+    return BSDF_KINDS[type(bsdf)]
+
+
+def _principled_eta(bsdf: description.Principled) -> float:
+    """Relative index of refraction; one that would not refract is moved off 1 as in Mitsuba 3 where light passes."""
+    transmits = bsdf_kind(bsdf) == "principled_transmissive"
+    if bsdf.eta is not None:
+        return 1.001 if transmits and bsdf.eta == 1.0 else bsdf.eta
+    specular = 0.5 if bsdf.specular is None else bsdf.specular
+    if transmits and specular == 0.0:
+        specular = 1e-3
+    return 2.0 / (1.0 - np.sqrt(0.08 * specular)) - 1.0
 
 
 def _relative_ior(bsdf) -> float:
@@ -51,11 +70,13 @@ class MaterialUpload:
             "dielectric": [],
             "plastic": [],
             "oren_nayar": [],
+            "principled": [],
         }
         self.coatings: list[np.ndarray] = []
         self.kinds: set[str] = set()
         self.known: dict[int, int] = {}
         self.mask = False
+        self.tangents = False  # whether some BSDF depends on the direction of its tangent
         self.keep_alive: list = []
 
     def upload(self, device: str) -> bsdf_tables.MaterialTables:
@@ -67,12 +88,21 @@ class MaterialUpload:
         materials.dielectric = struct_array(bsdf_tables.DielectricRecord, self.bsdfs["dielectric"], device)
         materials.plastic = struct_array(bsdf_tables.PlasticRecord, self.bsdfs["plastic"], device)
         materials.oren_nayar = struct_array(bsdf_tables.OrenNayarRecord, self.bsdfs["oren_nayar"], device)
+        materials.principled = struct_array(bsdf_tables.PrincipledRecord, self.bsdfs["principled"], device)
         coatings = np.concatenate([np.zeros(0), *self.coatings])
         materials.coatings = wp.array(coatings, dtype=wp.float32, device=device)
         return materials
 
     def _set(self, record: dict, name: str, value, where: str, scalar: bool = False):
         record[name], record[f"{name}_texture"] = self.atlas.parameter(self.scene, value, where, scalar)
+
+    def _set_alpha(self, record: dict, bsdf, where: str):
+        values = [
+            self.atlas.parameter(self.scene, value, f"{where}.{name}", scalar=True) for name, value in roughness(bsdf)
+        ]
+        record["alpha"] = [value for value, _ in values]
+        record["alpha_u_texture"], record["alpha_v_texture"] = (texture for _, texture in values)
+        self.tangents |= values[0] != values[1]
 
     def add(self, ref, where: str) -> int:
         """Index of the material of a BSDF record; the same record is stored once."""
@@ -92,7 +122,7 @@ class MaterialUpload:
             sides.append(sides[0] if back is front else self._bsdf(back, f"{where}.back"))
         else:
             front = self._bsdf(inner, where)
-            transmits = BSDF_KINDS[type(inner)] in bsdf_tables.TRANSMISSIVE
+            transmits = bsdf_kind(inner) in bsdf_tables.TRANSMISSIVE
             sides = [front, front if transmits else (int(bsdf_tables.KIND_NONE), 0)]
         (material["front"], material["front_index"]), (material["back"], material["back_index"]) = sides
         self.materials.append(material)
@@ -102,7 +132,7 @@ class MaterialUpload:
 
     def _bsdf(self, bsdf: description.Bsdf, where: str) -> tuple[int, int]:
         """Kind and record index of a BSDF that is neither two-sided nor a mask."""
-        kind = BSDF_KINDS[type(bsdf)]
+        kind = bsdf_kind(bsdf)
         self.kinds.add(kind)
         if kind == "null":
             return bsdf_tables.KINDS[kind], 0  # has no parameters, hence no record
@@ -136,13 +166,23 @@ class MaterialUpload:
                 )
                 record["first"] = sum(part.size for part in self.coatings)
                 self.coatings.append(transmittance)
+        elif isinstance(bsdf, description.Principled):
+            table = "principled"
+            record["eta"] = _principled_eta(bsdf)
+            record["specular_rate"] = bsdf.main_specular_sampling_rate
+            record["clearcoat_rate"] = bsdf.clearcoat_sampling_rate
+            record["diffuse_rate"] = bsdf.diffuse_reflectance_sampling_rate
+            self._set(record, "base_color", bsdf.base_color, f"{where}.base_color")
+            self.tangents |= bsdf.anisotropic != 0.0
+            for name in PRINCIPLED_FRACTIONS:
+                self._set(record, name, getattr(bsdf, name), f"{where}.{name}", scalar=True)
         else:
             table = "dielectric"
             record["eta"] = _relative_ior(bsdf)
             self._set(record, "reflectance", bsdf.specular_reflectance, f"{where}.specular_reflectance")
             self._set(record, "transmittance", bsdf.specular_transmittance, f"{where}.specular_transmittance")
         if kind in ("rough_conductor", "rough_dielectric"):
-            self._set(record, "alpha", bsdf.alpha, f"{where}.alpha", scalar=True)
+            self._set_alpha(record, bsdf, where)
             record["distribution"] = DISTRIBUTIONS[bsdf.distribution]
         self.bsdfs[table].append(record)
         return bsdf_tables.KINDS[kind], len(self.bsdfs[table]) - 1

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from wavefront.errors import SceneError
 from wavefront.scene import description
+from wavefront.scene.lookup import PRINCIPLED_FRACTIONS
 from wavefront.scene.mitsuba_values import Element, to_number, to_numbers
 from wavefront.scene.mitsuba_xml import Document, Plugin
 
@@ -45,6 +46,7 @@ class Materials:
             "thindielectric": self._dielectric,
             "plastic": self._plastic,
             "roughplastic": self._plastic,
+            "principled": self._principled,
             "twosided": self._twosided,
             "mask": self._mask,
             "null": self._null,
@@ -117,9 +119,7 @@ class Materials:
         if plugin.type == "roughconductor":
             fields |= self._roughness(plugin)
         plugin.finish("texture")
-        if "alpha" in fields and _is_smooth(fields["alpha"]):
-            del fields["alpha"], fields["distribution"]
-        return (description.RoughConductor if "alpha" in fields else description.Conductor)(**fields)
+        return (description.RoughConductor if "distribution" in fields else description.Conductor)(**fields)
 
     def _conductor_spectrum(self, plugin):
         material = plugin.string("material", "")
@@ -151,11 +151,9 @@ class Materials:
         if plugin.type == "roughdielectric":
             fields |= self._roughness(plugin)
         plugin.finish("texture")
-        if "alpha" in fields and _is_smooth(fields["alpha"]):
-            del fields["alpha"], fields["distribution"]
         if plugin.type == "thindielectric":
             return description.ThinDielectric(**fields)
-        return (description.RoughDielectric if "alpha" in fields else description.Dielectric)(**fields)
+        return (description.RoughDielectric if "distribution" in fields else description.Dielectric)(**fields)
 
     def _plastic(self, plugin):
         fields = {"nonlinear": plugin.boolean("nonlinear")}
@@ -168,9 +166,29 @@ class Materials:
                 raise plugin.error(f"{plugin.label()} needs one number alpha for both directions")
             fields |= self._roughness(plugin)
         plugin.finish("texture")
-        if "alpha" in fields and _is_smooth(fields["alpha"]):
-            del fields["alpha"], fields["distribution"]
-        return (description.RoughPlastic if "alpha" in fields else description.Plastic)(**fields)
+        return (description.RoughPlastic if "distribution" in fields else description.Plastic)(**fields)
+
+    def _principled(self, plugin):
+        fields = {"base_color": self.colour(plugin, "base_color", 0.5, limit=1.0)}
+        for name in PRINCIPLED_FRACTIONS:
+            fields[name] = self.scalar(plugin, name, getattr(description.Principled(), name), limit=1.0)
+        if plugin.has("eta") and plugin.has("specular"):
+            raise plugin.error(f"{plugin.label()} has either eta or specular")
+        for name, allowed, is_allowed in (
+            ("eta", "greater than 0", lambda value: value > 0.0),
+            ("specular", "from 0 to 1", lambda value: 0.0 <= value <= 1.0),
+            ("main_specular_sampling_rate", "greater than 0", lambda value: value > 0.0),
+            ("clearcoat_sampling_rate", "at least 0", lambda value: value >= 0.0),
+            ("diffuse_reflectance_sampling_rate", "at least 0", lambda value: value >= 0.0),
+        ):
+            if plugin.child(name) is not None:
+                raise plugin.error(f"{name} of {plugin.label()} must be a number, not a texture")
+            if plugin.has(name):
+                value = fields[name] = plugin.number(name)
+                if not is_allowed(value):
+                    raise plugin.get(name).error(f"{name} must be {allowed}; found {value:g}")
+        plugin.finish("texture")
+        return description.Principled(**fields)
 
     def _ior(self, plugin, name, default):
         element = plugin.get(name)
@@ -196,15 +214,21 @@ class Materials:
         if directions:
             if plugin.has("alpha"):
                 raise plugin.error("alpha excludes alpha_u and alpha_v")
-            first, second = (self.scalar(plugin, name, 0.1) for name in ("alpha_u", "alpha_v"))
-            if first != second:
-                raise plugin.error("anisotropic roughness is not supported; alpha_u and alpha_v must be equal")
-            alpha = first
+            fields = {name: self.scalar(plugin, name, 0.1) for name in ("alpha_u", "alpha_v")}
+            if fields["alpha_u"] == fields["alpha_v"]:
+                fields = {"alpha": fields["alpha_u"]}
         else:
-            alpha = self.scalar(plugin, "alpha", 0.1)
-        if isinstance(alpha, float) and alpha > 1.0:
-            raise plugin.error(f"alpha must be at most 1; found {alpha:g}")
-        return {"alpha": alpha, "distribution": distribution}
+            fields = {"alpha": self.scalar(plugin, "alpha", 0.1)}
+        for name, value in fields.items():
+            if isinstance(value, float) and value > 1.0:
+                raise plugin.error(f"{name} must be at most 1; found {value:g}")
+        if all(_is_smooth(value) for value in fields.values()):
+            return {}
+        if any(_is_smooth(value) for value in fields.values()):
+            raise plugin.error(f"alpha_u and alpha_v must both be below {SMOOTHEST:g}, or neither")
+        if fields.get("alpha") == 0.1:
+            del fields["alpha"]  # the default
+        return fields | {"distribution": distribution}
 
     def _twosided(self, plugin):
         sides = plugin.objects("bsdf")

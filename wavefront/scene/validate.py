@@ -36,6 +36,8 @@ def validate(
         for path, record in walk(scene):
             _check_numbers(record, path)
             _check_references(record, path, bsdfs, textures)
+            if hasattr(record, "alpha_u"):
+                _check_roughness(record, path)
             if isinstance(record, (description.Bitmap, description.Envmap)):
                 _check_file(record.file, IMAGE_SUFFIXES, "image", f"{path}.file")
             elif isinstance(record, (description.Conductor, description.RoughConductor)):
@@ -121,6 +123,12 @@ def _check_conductor(bsdf, path):
         _fail(path, f"a conductor has material, or eta and k; found {' and '.join(given) if given else 'none of them'}")
     if bsdf.material is not None and bsdf.material not in CONDUCTORS:
         _fail(f"{path}.material", unknown_name("metal", bsdf.material, CONDUCTORS))
+
+
+def _check_roughness(bsdf, path):
+    given = [name for name in ("alpha", "alpha_u", "alpha_v") if getattr(bsdf, name) is not None]
+    if given not in ([], ["alpha"], ["alpha_u", "alpha_v"]):
+        _fail(path, f"a rough surface has alpha, or alpha_u and alpha_v; found {' and '.join(given)}")
 
 
 def _check_dielectric(bsdf, path):

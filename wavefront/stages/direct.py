@@ -8,6 +8,7 @@ import warp as wp
 
 from wavefront.accel.mesh_query import INFINITE, Geometry
 from wavefront.bsdf.dispatch import is_smooth, make_bsdf
+from wavefront.bsdf.frame import make_frame
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.light.mis import power_heuristic
 from wavefront.light.sampling import make_light_sampler
@@ -35,9 +36,11 @@ def make_direct(
     lights: tuple[str, ...],
     light_textures: tuple[str, ...],
     uvs: bool,
+    tangents: bool,
 ):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
-    eval_bsdf, _, _ = make_bsdf(bsdfs, mask, textures)
+    eval_bsdf, _, _ = make_bsdf(bsdfs, mask, textures, tangents)
+    frame_at, _ = make_frame(tangents)
     sample_light, _ = make_light_sampler(lights, light_textures)
     extended = any(kind not in DELTA for kind in lights)
 
@@ -61,9 +64,9 @@ def make_direct(
             return
         slot = hits.slots[i]
         material = surfaces.material[slot]
-        normal = surfaces.shading_normal[slot]
+        frame = frame_at(surfaces, slot)
         wo = -paths.direction[slot]
-        if not is_smooth(materials.materials[material], wp.dot(normal, wo)):
+        if not is_smooth(materials.materials[material], wp.dot(frame.normal, wo)):
             return
 
         # propose
@@ -77,7 +80,7 @@ def make_direct(
         uv = wp.vec2(0.0)
         if wp.static(uvs):
             uv = surfaces.uv[slot]
-        bsdf = eval_bsdf(materials, textures, material, uv, normal, wo, light.wi)
+        bsdf = eval_bsdf(materials, textures, material, uv, frame, wo, light.wi)
         if bsdf.value[0] + bsdf.value[1] + bsdf.value[2] == 0.0:
             return
 

@@ -12,10 +12,18 @@ from wavefront.surface import make_vertex
 
 
 @functools.cache
-def make_intersect(triangles: bool, spheres: bool, smooth: bool, uvs: bool, area_lights: bool, escape_lights: bool):
+def make_intersect(
+    triangles: bool,
+    spheres: bool,
+    smooth: bool,
+    uvs: bool,
+    tangents: bool,
+    area_lights: bool,
+    escape_lights: bool,
+):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name (or whether there are any)."""
     closest_hit, _ = make_intersector(triangles, spheres)
-    vertex_of = make_vertex(triangles, spheres, smooth, uvs)
+    vertex_of = make_vertex(triangles, spheres, smooth, uvs, tangents)
 
     @wp.kernel(enable_backward=False, module="unique")
     def closest_hits(
@@ -51,6 +59,8 @@ def make_intersect(triangles: bool, spheres: bool, smooth: bool, uvs: bool, area
         surfaces.material[slot] = shape.material
         if wp.static(uvs):
             surfaces.uv[slot] = vertex.uv
+        if wp.static(tangents):
+            surfaces.tangent[slot] = vertex.tangent
         if wp.static(area_lights):
             light = int(-1)
             front = wp.dot(vertex.geometric_normal, direction) < 0.0

@@ -7,6 +7,7 @@ import functools
 import warp as wp
 
 from wavefront.bsdf.dispatch import make_bsdf
+from wavefront.bsdf.frame import make_frame
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.queues import DEPTH, NONFINITE_SCATTER, Paths, Queue, Surfaces, push, queue_size
 from wavefront.rng import PURPOSE_BSDF, uniform4
@@ -23,10 +24,17 @@ def survival_probability(beta: wp.vec3, eta: float) -> float:
 
 @functools.cache
 def make_scatter(
-    bsdfs: tuple[str, ...], mask: bool, textures: tuple[str, ...], uvs: bool, transmission: bool, roulette: bool
+    bsdfs: tuple[str, ...],
+    mask: bool,
+    textures: tuple[str, ...],
+    uvs: bool,
+    tangents: bool,
+    transmission: bool,
+    roulette: bool,
 ):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
-    _, sample_bsdf, _ = make_bsdf(bsdfs, mask, textures)
+    _, sample_bsdf, _ = make_bsdf(bsdfs, mask, textures, tangents)
+    frame_at, _ = make_frame(tangents)
 
     @wp.kernel(enable_backward=False, module="unique")
     def scatter_paths(
@@ -58,7 +66,7 @@ def make_scatter(
             textures,
             surfaces.material[slot],
             uv,
-            surfaces.shading_normal[slot],
+            frame_at(surfaces, slot),
             -paths.direction[slot],
             wp.vec3(u[0], u[1], u[2]),
         )
