@@ -67,7 +67,10 @@ def make_bsdf(kinds: tuple[str, ...], mask: bool, textures: tuple[str, ...], tan
 
     @wp.func
     def opacity_at(textures: TextureTables, material: Material, uv: wp.vec2) -> float:
-        return wp.clamp(eval_scalar(textures, material.opacity, material.opacity_texture, uv), 0.0, 1.0)
+        opacity = eval_scalar(textures, material.opacity, material.opacity_texture, uv)
+        if material.cutoff > 0.0:
+            return wp.where(opacity >= material.cutoff, 1.0, 0.0)
+        return wp.clamp(opacity, 0.0, 1.0)
 
     @wp.func
     def mirror_side(kind: int, v: wp.vec3, cos_o: float) -> wp.vec3:

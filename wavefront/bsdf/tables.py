@@ -47,6 +47,7 @@ class Material:
     back_index: wp.int32
     opacity: wp.float32
     opacity_texture: wp.int32
+    cutoff: wp.float32  # above 0: opacity is 1 from here on, and 0 below
 
 
 @wp.struct

@@ -74,6 +74,13 @@ class Bitmap(Record, tag_field="type", tag="bitmap"):
 
     file: Annotated[str, Meta(description="Path of the image, relative to the scene file.", min_length=1)]
     name: str = ""
+    image: Annotated[
+        Annotated[int, Meta(ge=0)] | None, Meta(description="Index of an image that lies inside a glTF file.")
+    ] = None
+    channel: Annotated[
+        Literal["r", "g", "b", "a"] | None,
+        Meta(description="This one alone, as a number; default: the colour. a is 1 where the image has no alpha."),
+    ] = None
     color_space: Annotated[
         Literal["auto", "srgb", "linear"],
         Meta(description="How values are encoded; auto: 8-bit colours are sRGB, all else is linear."),
@@ -284,6 +291,10 @@ class Mask(Record, tag_field="type", tag="mask"):
     bsdf: Annotated[str | Bsdf, Meta(description="Name of a BSDF, or a BSDF.")]
     name: str = ""
     opacity: Opacity = 0.5
+    cutoff: Annotated[
+        Positive | None,
+        Meta(description="Where opacity is at least this, the surface is there for certain, and elsewhere it is not."),
+    ] = None
 
 
 Bsdf = (

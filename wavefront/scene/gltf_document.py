@@ -10,6 +10,7 @@ import base64
 import binascii
 import functools
 import os
+import re
 import struct
 import urllib.parse
 from pathlib import Path
@@ -42,6 +43,7 @@ SUPPORTED_EXTENSIONS = frozenset(
     )
 )
 _LARGEST = float(np.finfo(np.float32).max)
+_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
 _IMAGE_MAGIC = ((b"\x89PNG\r\n\x1a\n", ".png"), (b"\xff\xd8\xff", ".jpg"))
 
 Index = Annotated[int, Meta(ge=0)]
@@ -461,9 +463,9 @@ class Document:
             try:
                 return path.read_bytes()
             except FileNotFoundError:
-                raise self.error(where, f"file not found: {shown(str(path))}") from None
+                raise self.error(where, f"file not found: {shown(uri)}") from None
             except OSError as error:
-                raise self.error(where, f"{shown(str(path))} cannot be read: {error.strerror or error}") from None
+                raise self.error(where, f"{shown(uri)} cannot be read: {error.strerror or error}") from None
         header, comma, text = uri.partition(",")
         if not comma:
             raise self.error(where, "a data URI without a comma")
@@ -475,7 +477,7 @@ class Document:
         return urllib.parse.unquote_to_bytes(text)
 
     def _uri_path(self, uri, where):
-        if urllib.parse.urlsplit(uri).scheme if "[" not in uri else False:
+        if _SCHEME.match(uri):
             raise self.error(where, f"{shown(uri)} is not supported; supported: a relative path, or a data URI")
         name = urllib.parse.unquote(uri)
         if not name or "\0" in name:

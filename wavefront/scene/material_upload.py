@@ -113,6 +113,7 @@ class MaterialUpload:
         inner = bsdf
         if isinstance(inner, description.Mask):
             self._set(material, "opacity", inner.opacity, f"{where}.opacity", scalar=True)
+            material["cutoff"] = inner.cutoff or 0.0
             self.mask = True
             inner, where = resolve_bsdf(self.scene, inner.bsdf), f"{where}.bsdf"
         if isinstance(inner, description.TwoSided):
