@@ -212,7 +212,7 @@ def test_scenes_are_chosen_by_name_or_number(builder, tmp_path):
     builder.tree["scene"] = 1
     where = [load(builder, tmp_path, **p)[0].shapes[0].to_world[0][3] for p in ({}, {"scene": "s2"}, {"scene": "0"})]
     assert where == [2.0, 3.0, 1.0]
-    with pytest.raises(SceneError, match=r"unknown scene 's9'; did you mean .*known: 's0', 's1', 's2'"):
+    with pytest.raises(SceneError, match=r"unknown scene 's9'; known: 's0', 's1', 's2'"):
         load(builder, tmp_path, scene="s9")
     del builder.tree["scene"]
     assert load(builder, tmp_path)[0].description == "s0"
@@ -287,7 +287,7 @@ def test_a_camera_is_made_where_there_is_none(builder, tmp_path):
     scene, warnings = load(triangle_scene(builder, translation=[100, 0, 0]), tmp_path)
     assert "cameras: the scene has no camera; one is put where it sees all meshes" in warnings
     matrix = np.array(scene.camera.to_world)
-    corners = TRIANGLE + (100, 0, 0) - matrix[:3, 3]
+    corners = TRIANGLE + np.array((100, 0, 0)) - matrix[:3, 3]
     assert (np.abs(corners[:, :2]) <= -corners[:, 2:] * math.tan(math.radians(scene.camera.fov / 2))).all()
 
 
