@@ -30,7 +30,7 @@ from wavefront.texture import TextureTables, make_eval_parameter
 from wavefront.warp_samples import square_to_gaussian, square_to_tent
 
 TEXTURES = ("bytes", "checkerboard", "floats")
-LIGHTS = tuple(sorted(set(LIGHT_KINDS) - {"envmap_bytes"}))  # of environment maps, those of floats
+LIGHTS = tuple(sorted(set(LIGHT_KINDS) - {"envmap_bytes", "envmap_halves"}))  # of environment maps, those of floats
 BOX, TENT, GAUSSIAN = wp.constant(0), wp.constant(1), wp.constant(2)
 FILTERS = {"box": 0, "tent": 1, "gaussian": 2}
 
@@ -55,7 +55,7 @@ def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool, tan
     vertex_of = make_vertex(triangles, spheres, smooth, uvs, tangents)
     eval_bsdf, sample_bsdf, _ = make_bsdf(tuple(sorted(BSDF_KINDS)), True, TEXTURES, tangents)
     sample_light, light_pdf = make_light_sampler(LIGHTS, TEXTURES)
-    eval_envmap, _ = make_envmap(False, nee)
+    eval_envmap, _ = make_envmap("floats", nee)
     eval_parameter = make_eval_parameter(TEXTURES)
 
     @wp.kernel(enable_backward=False, module="unique")

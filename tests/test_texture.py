@@ -5,6 +5,8 @@ import pytest
 import warp as wp
 
 from wavefront.texture import (
+    IMAGE_TYPES,
+    KINDS,
     WRAP_MODES,
     TextureRecord,
     TextureTables,
@@ -13,7 +15,7 @@ from wavefront.texture import (
 )
 
 DEVICE = "cpu"
-eval_texture = make_eval_texture(("bytes", "checkerboard", "floats"))
+eval_texture = make_eval_texture(tuple(sorted(KINDS)))
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -38,19 +40,25 @@ IMAGES = {
     "tall": RNG.integers(0, 256, (16384, 1, 1), np.uint8),
     "float rgb": RNG.exponential(size=(6, 4, 3)).astype(np.float32),
     "float grey": RNG.exponential(size=(2, 9, 1)).astype(np.float32),
+    "half rgb": RNG.exponential(size=(3, 7, 3)).astype(np.float16),
+    "half grey": RNG.exponential(size=(1, 5, 1)).astype(np.float16),
+    "short rgb": RNG.integers(0, 65536, (4, 3, 3), np.uint16),
+    "short grey": RNG.integers(0, 65536, (9, 2, 1), np.uint16),
+    "wide shorts": RNG.integers(0, 65536, (1, 16384, 1), np.uint16),
+    "tall halves": RNG.exponential(size=(16384, 1, 3)).astype(np.float16),
 }
 COLORS = (0.1, 0.5, 2.0), (0.7, 0.0, 0.3)
 
 
-def upload(name, srgb=False, nearest=False, wrap="repeat", rows=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))):
+def upload(name, srgb=False, nearest=False, wrap="repeat", rows=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), scale=1.0):
     """All images in one table, as in a scene, so that a wrong offset would be seen; and the index of `name`."""
     host = np.zeros(len(IMAGES) + 1, dtype=TextureRecord.numpy_dtype())
-    parts = {np.dtype(np.uint8): [], np.dtype(np.float32): []}
+    parts = {kind: [] for kind in IMAGE_TYPES}
     for record, pixels in zip(host, IMAGES.values(), strict=False):
-        store = parts[pixels.dtype]
-        record["first"] = sum(part.size for part in store)
-        store.append(pixels.ravel())
-        record["kind"] = 1 if pixels.dtype == np.uint8 else 2
+        kind = next(name for name, dtype in IMAGE_TYPES.items() if dtype == pixels.dtype)
+        record["first"] = sum(part.size for part in parts[kind])
+        parts[kind].append(pixels.ravel())
+        record["kind"], record["scale"] = KINDS[kind], scale
         record["height"], record["width"], record["channels"] = pixels.shape
         record["srgb"], record["nearest"], record["wrap"] = srgb, nearest, WRAP_MODES[wrap]
         record["uv_row0"], record["uv_row1"] = rows
@@ -58,9 +66,10 @@ def upload(name, srgb=False, nearest=False, wrap="repeat", rows=((1.0, 0.0, 0.0)
     host[-1]["uv_row0"], host[-1]["uv_row1"] = rows
     tables = TextureTables()
     tables.records = wp.array(host, dtype=TextureRecord, device=DEVICE)
-    tables.bytes = wp.array(np.concatenate(parts[np.dtype(np.uint8)]), dtype=wp.uint8, device=DEVICE)
-    tables.floats = wp.array(np.concatenate(parts[np.dtype(np.float32)]), dtype=wp.float32, device=DEVICE)
+    for kind, arrays in parts.items():
+        setattr(tables, kind, wp.array(np.concatenate(arrays), device=DEVICE))
     tables.srgb_to_linear = wp.array(srgb_to_linear(np.arange(256) / 255.0), dtype=wp.float32, device=DEVICE)
+    tables.srgb16_to_linear = wp.array(srgb_to_linear(np.arange(65536) / 65535.0), dtype=wp.float32, device=DEVICE)
     return tables, (len(IMAGES) if name == "checkerboard" else list(IMAGES).index(name))
 
 
@@ -84,8 +93,8 @@ def wrapped(i, size, mode):
 def linear_pixels(name, srgb):
     pixels = IMAGES[name]
     values = pixels.astype(np.float64)
-    if pixels.dtype == np.uint8:
-        values /= 255.0
+    if pixels.dtype.kind == "u":
+        values /= np.iinfo(pixels.dtype).max
         if srgb:  # IEC 61966-2-1, written out
             values = np.where(values <= 0.04045, values / 12.92, np.power((values + 0.055) / 1.055, 2.4))
     return np.broadcast_to(values, (*values.shape[:2], 3))
@@ -172,6 +181,35 @@ def test_srgb_table_is_exact():
     np.testing.assert_allclose(look_up(tables, texture, uv), expected[IMAGES["wide"][0]], rtol=1e-6)
 
 
+def test_srgb_table_of_16_bit_is_exact():
+    tables, texture = upload("wide shorts", srgb=True, nearest=True)
+    x = np.arange(16384)
+    uv = np.stack([(x + 0.5) / 16384, np.full(16384, 0.5)], axis=1).astype(np.float32)
+    np.testing.assert_allclose(look_up(tables, texture, uv), linear_pixels("wide shorts", True)[0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["rgb", "short grey", "half rgb", "float rgb"])
+@pytest.mark.parametrize("nearest", [False, True])
+def test_scale_multiplies_the_linear_values(name, nearest):
+    uv = coordinates(5)
+    tables, texture = upload(name, srgb=True, nearest=nearest)
+    scaled, _ = upload(name, srgb=True, nearest=nearest, scale=4.0)
+    np.testing.assert_array_equal(look_up(scaled, texture, uv), 4.0 * look_up(tables, texture, uv))
+
+
+def test_mirrored_nearest_at_the_edges():
+    """On both sides of every border the mirror repeats the border pixel; by hand, where the pixel is not in doubt."""
+    pixels = IMAGES["rgb"][:, :, 0] / 255.0
+    tables, texture = upload("rgb", nearest=True, wrap="mirror")
+    height, width = pixels.shape
+    for edge in range(-4, 5):
+        for side in (-0.25, 0.25):
+            u = edge + side / width
+            column = 0 if edge % 2 == 0 else width - 1
+            found = look_up(tables, texture, np.float32([[u, 0.5 / height], [u, -0.5 / height]]))
+            np.testing.assert_allclose(found[:, 0], pixels[0, column], rtol=1e-6)
+
+
 def test_pixel_centres_are_exact():
     """Bilinear at the centre of a pixel is the pixel; (0, 0) of the coordinates is the upper left corner."""
     tables, texture = upload("rgb")
@@ -208,7 +246,7 @@ def test_uv_transform_rotates_scales_and_moves():
     np.testing.assert_allclose(look_up(tables, texture, uv), expected, atol=1e-3)
 
 
-@pytest.mark.parametrize("name", ["rgb", "float grey", "checkerboard"])
+@pytest.mark.parametrize("name", ["rgb", "short rgb", "half rgb", "float grey", "checkerboard"])
 def test_coordinates_that_are_not_finite_give_black(name):
     tables, texture = upload(name)
     uv = np.float32([[np.nan, 0.0], [0.0, np.inf], [-np.inf, 0.5], [3e38, 3e38]])

@@ -1,6 +1,6 @@
 """Converts a scene to our JSON format: ``python -m tools.convert scene.xml out.json``.
 
-Meshes are written as binary PLY to ``<out>_meshes/`` and textures are copied to ``<out>_textures/``, both beside the
+Meshes are written as binary PLY to ``<out>_meshes/`` and textures are copied or extracted to ``<out>_textures/``, both beside the
 JSON file, which refers to them by relative path. Everything is written under temporary names first, and the JSON file
 is put in place last, so that an error leaves nothing half-written.
 """
@@ -17,6 +17,7 @@ from pathlib import Path
 
 from wavefront.errors import SceneError, WavefrontError
 from wavefront.scene import description, json_format, load_scene, meshes
+from wavefront.scene.gltf_images import embedded_image
 from wavefront.scene.images import replacing
 from wavefront.scene.lookup import walk
 
@@ -71,21 +72,28 @@ def _write_meshes(scene, folder, final):
 
 
 def _copy_textures(scene, folder, final):
-    copied: dict[str, Path] = {}
+    copied: dict[tuple, Path] = {}
     taken: set[str] = set()
     for path, record in walk(scene):
         if not isinstance(record, (description.Bitmap, description.Envmap)):
             continue
-        if record.file not in copied:
+        source, image = Path(record.file), getattr(record, "image", None)
+        if (source, image) not in copied:
             folder.mkdir(exist_ok=True)
-            source = Path(record.file)
-            name = _free_name(source.stem, source.suffix, taken)
-            try:
-                shutil.copyfile(source, folder / name)
-            except FileNotFoundError:
-                raise SceneError(f"{source}: file not found", path=f"{path}.file") from None
-            copied[record.file] = final / name
-        record.file = str(copied[record.file])
+            if image is not None:
+                data, suffix = embedded_image(record.file, image, f"{path}.file")
+                name = _free_name(f"{source.stem}_{image}", suffix, taken)
+                (folder / name).write_bytes(data)
+            else:
+                name = _free_name(source.stem, source.suffix, taken)
+                try:
+                    shutil.copyfile(source, folder / name)
+                except FileNotFoundError:
+                    raise SceneError(f"{source}: file not found", path=f"{path}.file") from None
+            copied[source, image] = final / name
+        record.file = str(copied[source, image])
+        if image is not None:
+            record.image = None
 
 
 def _free_name(stem, suffix, taken):
@@ -112,10 +120,10 @@ def _replace_folder(new, final, mark):
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code: 0, or 2 after an error, of which one line is printed."""
     parser = argparse.ArgumentParser(prog="python -m tools.convert", description=__doc__.split("\n\n")[0])
-    parser.add_argument("scene", help="the scene to convert: Mitsuba XML, or our JSON")
+    parser.add_argument("scene", help="the scene to convert: Mitsuba XML, glTF, or our JSON")
     parser.add_argument("out", help="the JSON file to write")
     parser.add_argument("-D", dest="parameters", action="append", default=[], metavar="NAME=VALUE",
-                        help="a value for $NAME in a Mitsuba scene; may be repeated")  # fmt: skip
+                        help="a value for $NAME in a Mitsuba scene, camera or scene in a glTF file; may be repeated")  # fmt: skip
     parser.add_argument("--quiet", action="store_true", help="print no warnings")
     options = parser.parse_args(arguments)
     try:

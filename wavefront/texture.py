@@ -1,6 +1,6 @@
 """Textures: bitmaps in their file's own precision, and checkerboards.
 
-All pixels of 8-bit bitmaps lie in one byte array and all pixels of float bitmaps in one float array; a record says
+All pixels of bitmaps of one type (8-bit and 16-bit integers, half and single precision) lie in one array; a record says
 where a texture starts and how to read it. (u, v) = (0, 0) is the upper left corner of the image.
 """
 
@@ -14,6 +14,10 @@ import warp as wp
 KIND_CHECKERBOARD = wp.constant(0)
 KIND_BYTES = wp.constant(1)
 KIND_FLOATS = wp.constant(2)
+KIND_SHORTS = wp.constant(3)
+KIND_HALVES = wp.constant(4)
+KINDS = {"checkerboard": 0, "bytes": 1, "floats": 2, "shorts": 3, "halves": 4}
+IMAGE_TYPES = {"bytes": np.uint8, "shorts": np.uint16, "halves": np.float16, "floats": np.float32}
 
 WRAP_REPEAT = wp.constant(0)
 WRAP_MIRROR = wp.constant(1)
@@ -24,13 +28,14 @@ WRAP_MODES = {"repeat": 0, "mirror": 1, "clamp": 2}
 @wp.struct
 class TextureRecord:
     kind: wp.int32
-    first: wp.int64  # index of the first value in the byte or float array
+    first: wp.int64  # index of the first value in the array of its kind
     width: wp.int32
     height: wp.int32
     channels: wp.int32  # 1 or 3
-    srgb: wp.int32  # 1 if bytes are sRGB-encoded
+    srgb: wp.int32  # 1 if integers are sRGB-encoded
     nearest: wp.int32  # 1: no interpolation
     wrap: wp.int32
+    scale: wp.vec3  # of a bitmap
     uv_row0: wp.vec3
     uv_row1: wp.vec3
     color0: wp.vec3  # of a checkerboard
@@ -41,8 +46,11 @@ class TextureRecord:
 class TextureTables:
     records: wp.array[TextureRecord]
     bytes: wp.array[wp.uint8]
+    shorts: wp.array[wp.uint16]
+    halves: wp.array[wp.float16]
     floats: wp.array[wp.float32]
-    srgb_to_linear: wp.array[wp.float32]  # 256 entries
+    srgb_to_linear: wp.array[wp.float32]  # 256 entries, where some bytes are sRGB-encoded
+    srgb16_to_linear: wp.array[wp.float32]  # 65536 entries, where some shorts are
 
 
 def srgb_to_linear(value: np.ndarray) -> np.ndarray:
@@ -70,11 +78,14 @@ def make_eval_texture(kinds: tuple[str, ...]):
     """`eval_texture(tables, texture, uv) -> vec3` for the kinds of texture in a scene.
 
     Args:
-        kinds: Subset of ``("bytes", "checkerboard", "floats")``.
+        kinds: Subset of `KINDS`, sorted.
     """
     has_bytes = "bytes" in kinds
+    has_shorts = "shorts" in kinds
+    has_halves = "halves" in kinds
     has_floats = "floats" in kinds
     has_checkerboard = "checkerboard" in kinds
+    has_images = has_bytes or has_shorts or has_halves or has_floats
 
     @wp.func
     def fetch(tables: TextureTables, record: TextureRecord, x: int, y: int) -> wp.vec3:
@@ -94,6 +105,24 @@ def make_eval_texture(kinds: tuple[str, ...]):
                     rgb = wp.vec3(tables.srgb_to_linear[r], tables.srgb_to_linear[g], tables.srgb_to_linear[b])
                 else:
                     rgb = wp.vec3(float(r), float(g), float(b)) / 255.0
+        if wp.static(has_shorts):
+            if record.kind == KIND_SHORTS:
+                r = wp.int32(tables.shorts[i])
+                g = r
+                b = r
+                if record.channels == 3:
+                    g = wp.int32(tables.shorts[i + wp.int64(1)])
+                    b = wp.int32(tables.shorts[i + wp.int64(2)])
+                if record.srgb == 1:
+                    rgb = wp.vec3(tables.srgb16_to_linear[r], tables.srgb16_to_linear[g], tables.srgb16_to_linear[b])
+                else:
+                    rgb = wp.vec3(float(r), float(g), float(b)) / 65535.0
+        if wp.static(has_halves):
+            if record.kind == KIND_HALVES:
+                grey = float(tables.halves[i])
+                rgb = wp.vec3(grey)
+                if record.channels == 3:
+                    rgb = wp.vec3(grey, float(tables.halves[i + wp.int64(1)]), float(tables.halves[i + wp.int64(2)]))
         if wp.static(has_floats):
             if record.kind == KIND_FLOATS:
                 grey = tables.floats[i]
@@ -115,7 +144,7 @@ def make_eval_texture(kinds: tuple[str, ...]):
                 in_left = u - wp.floor(u) < 0.5
                 in_top = v - wp.floor(v) < 0.5
                 return wp.where(in_left == in_top, record.color0, record.color1)
-        if wp.static(has_bytes or has_floats):
+        if wp.static(has_images):
             # Whole periods of the largest wrap mode are taken off first, so that the product with the size is exact
             # enough and fits an int however far the coordinate is.
             if record.wrap == WRAP_CLAMP:
@@ -127,7 +156,7 @@ def make_eval_texture(kinds: tuple[str, ...]):
             x = u * float(record.width)
             y = v * float(record.height)
             if record.nearest == 1:
-                return fetch(tables, record, int(wp.floor(x)), int(wp.floor(y)))
+                return wp.cw_mul(record.scale, fetch(tables, record, int(wp.floor(x)), int(wp.floor(y))))
             x -= 0.5  # pixel centres are at half-integers
             y -= 0.5
             x0 = int(wp.floor(x))
@@ -136,7 +165,7 @@ def make_eval_texture(kinds: tuple[str, ...]):
             fy = y - wp.floor(y)
             top = (1.0 - fx) * fetch(tables, record, x0, y0) + fx * fetch(tables, record, x0 + 1, y0)
             bottom = (1.0 - fx) * fetch(tables, record, x0, y0 + 1) + fx * fetch(tables, record, x0 + 1, y0 + 1)
-            return (1.0 - fy) * top + fy * bottom
+            return wp.cw_mul(record.scale, (1.0 - fy) * top + fy * bottom)
         return wp.vec3(0.0)
 
     @wp.func

@@ -19,22 +19,27 @@ N = 200_000
 TURN = [d.TransformStep(rotate=d.Rotate(axis=(1.0, 2.0, -0.5), angle=67.0))]
 LUMINANCE = np.array((0.212671, 0.715160, 0.072169))
 
-eval_envmap, sample_envmap = make_envmap(False)
-eval_bytes, _ = make_envmap(True)
+eval_envmap, sample_envmap = make_envmap("floats")
+eval_halves, _ = make_envmap("halves")
+eval_bytes, _ = make_envmap("bytes")
 
 
 @wp.kernel(enable_backward=False, module="unique")
 def eval_kernel(
     env: EnvironmentMap,
-    in_bytes: int,
+    storage: int,
     w: wp.array(dtype=wp.vec3),
     # outputs
     radiance: wp.array(dtype=wp.vec3),
     pdf: wp.array(dtype=float),
 ):
     i = wp.tid()
-    if in_bytes == 1:
+    if storage == 1:
         found = eval_bytes(env, w[i])
+        radiance[i] = found.L
+        pdf[i] = found.pdf
+    elif storage == 2:
+        found = eval_halves(env, w[i])
         radiance[i] = found.L
         pdf[i] = found.pdf
     else:
@@ -104,10 +109,10 @@ def upload(folder, name, **fields):
     return upload_scene(d.Scene(emitters=[d.Envmap(file=file, **fields)]), DEVICE).lights
 
 
-def evaluate(env, w, in_bytes=0):
+def evaluate(env, w, storage=0):
     w = wp.array(np.ascontiguousarray(w, np.float32), dtype=wp.vec3, device=DEVICE)
     L, pdf = wp.zeros(len(w), dtype=wp.vec3, device=DEVICE), wp.zeros(len(w), dtype=float, device=DEVICE)
-    wp.launch(eval_kernel, dim=len(w), inputs=[env, in_bytes, w], outputs=[L, pdf], device=DEVICE)
+    wp.launch(eval_kernel, dim=len(w), inputs=[env, storage, w], outputs=[L, pdf], device=DEVICE)
     return L.numpy().astype(np.float64), pdf.numpy().astype(np.float64)
 
 
@@ -190,6 +195,25 @@ def test_bytes_are_srgb(folder):
     (a, pdf_a), (b, pdf_b) = (evaluate(s.lights.envmap, w, 1 - i) for i, s in enumerate(device_scenes))
     np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(pdf_a, pdf_b, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_halves_stay_halves(folder, channels):
+    """A file of halves takes two bytes a channel, and gives bit for bit what a file of the same floats gives."""
+    values = noise(7, 12, channels=channels).astype(np.float16)
+    names = "RGB" if channels == 3 else "Y"
+    planes = {c: values[:, :, i] for i, c in enumerate(names)}
+    files = [folder / "halves.exr", folder / "floats.exr"]
+    for file, half in zip(files, (True, False), strict=True):
+        write_exr(file, planes, half=half)
+    scenes = [upload_scene(d.Scene(emitters=[d.Envmap(file=str(file), scale=3.0)]), DEVICE) for file in files]
+    assert [scene.light_kinds for scene in scenes] == [("envmap_halves",), ("envmap_floats",)]
+    maps = [scene.lights.envmap for scene in scenes]
+    assert maps[0].halves.capacity == values.nbytes
+    assert maps[1].floats.capacity == 2 * values.nbytes
+    w = on_sphere(*np.random.default_rng(5).random((2, 5000)))
+    for a, b in zip(evaluate(maps[0], w, 2), evaluate(maps[1], w, 0), strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 # --- sampling ----------------------------------------------------------------------------------------------------
@@ -329,11 +353,17 @@ def test_a_file_of_radiance_hdr(folder):
     pixels[:, :, 3] = rng.integers(120, 137, (3, 5))
     (folder / "a.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 3 +X 5\n" + pixels.tobytes())
     read = load_image(folder / "a.hdr")
-    assert read.dtype == np.float32
+    assert read.dtype == np.float16
     assert read.shape == (3, 5, 3)
     expected = pixels[:, :, :3] * 2.0 ** (pixels[:, :, 3:].astype(float) - 136)
     step = 2.0 ** (pixels[:, :, 3:].astype(float) - 136)
     assert (np.abs(read - expected) <= step).all()
+    pixels[1, 2, 3] = 150  # beyond the largest half
+    (folder / "b.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 3 +X 5\n" + pixels.tobytes())
+    large = load_image(folder / "b.hdr")
+    assert large.dtype == np.float32
+    assert large[1, 2].max() >= 2.0**21
+    np.testing.assert_array_equal(large[0], read[0])
     (folder / "bad.hdr").write_bytes(b"not one")
     with pytest.raises(SceneError, match=r"bad\.hdr: cannot be read"):
         load_image(folder / "bad.hdr")

@@ -2,6 +2,7 @@
 
 import numpy as np
 import OpenEXR
+import OpenImageIO
 import pytest
 from PIL import Image
 
@@ -43,12 +44,72 @@ def test_palette_is_expanded(tmp_path):
     np.testing.assert_array_equal(load_image(tmp_path / "a.png"), expected)
 
 
-def test_16_bit_grey_becomes_float(tmp_path):
+def write_oiio(path, pixels, kind):
+    spec = OpenImageIO.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    output = OpenImageIO.ImageOutput.create(str(path))
+    assert output.open(str(path), spec)
+    assert output.write_image(pixels)
+    output.close()
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+def test_16_bit_integers_are_kept(tmp_path, suffix, channels):
+    """Every bit of every channel but alpha, which is not multiplied in."""
+    values = np.random.default_rng(4).integers(0, 65536, (5, 3, channels), np.uint16)
+    values[..., -1] //= 7
+    write_oiio(tmp_path / f"a{suffix}", values, "uint16")
+    pixels = load_image(tmp_path / f"a{suffix}")
+    assert pixels.dtype == np.uint16
+    np.testing.assert_array_equal(pixels, values[:, :, : 3 if channels >= 3 else 1])
+
+
+def test_16_bit_grey_of_pillow(tmp_path):
     values = np.array([[0, 1, 65535], [256, 32768, 12345]], np.uint16)
     Image.fromarray(values).save(tmp_path / "a.png")
-    pixels = load_image(tmp_path / "a.png")
+    np.testing.assert_array_equal(load_image(tmp_path / "a.png")[:, :, 0], values)
+
+
+@pytest.mark.parametrize("kind", ["uint8", "float"])
+def test_tiff(tmp_path, kind):
+    values = (200 * np.random.default_rng(5).random((4, 6, 3))).astype(np.uint8 if kind == "uint8" else np.float32)
+    write_oiio(tmp_path / "a.tiff", values, kind)
+    pixels = load_image(tmp_path / "a.tiff")
+    assert pixels.dtype == values.dtype
+    np.testing.assert_array_equal(pixels, values)
+
+
+@pytest.mark.parametrize("name", ["a.bmp", "a.tga"])
+def test_other_8_bit_formats(tmp_path, rgb, name):
+    Image.fromarray(rgb).save(tmp_path / name)
+    np.testing.assert_array_equal(load_image(tmp_path / name), rgb)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tif"])
+def test_truncated_16_bit_files(tmp_path, name):
+    write_oiio(tmp_path / name, np.random.default_rng(6).integers(0, 65536, (64, 64, 3), np.uint16), "uint16")
+    data = (tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes(data[: len(data) // 2])
+    with pytest.raises(SceneError, match="cannot be read") as caught:
+        load_image(tmp_path / name)
+    assert "\n" not in str(caught.value)
+
+
+def test_five_channels_are_refused(tmp_path):
+    write_oiio(tmp_path / "a.tif", np.zeros((2, 2, 5), np.uint8), "uint8")
+    with pytest.raises(SceneError, match="has 5 channels"):
+        load_image(tmp_path / "a.tif")
+
+
+def test_exr_of_halves_and_floats_becomes_floats(tmp_path):
+    values = np.full((2, 2), 0.1)
+    planes = {"R": values.astype(np.float16), "G": values.astype(np.float32), "B": values.astype(np.float16)}
+    with OpenEXR.File({"type": OpenEXR.scanlineimage}, dict(planes)) as file:
+        file.write(str(tmp_path / "a.exr"))
+    pixels = load_image(tmp_path / "a.exr")
     assert pixels.dtype == np.float32
-    np.testing.assert_allclose(pixels[:, :, 0], values / 65535.0, rtol=1e-6)
+    np.testing.assert_array_equal(pixels[0, 0], [planes[c][0, 0] for c in "RGB"])
 
 
 def test_jpeg(tmp_path):
@@ -65,8 +126,8 @@ def test_exr_round_trip(tmp_path, half):
     write_exr(tmp_path / "a.exr", dict(zip(names, values, strict=True)), half=half)
     only_file(tmp_path, "a.exr")
     pixels = load_image(tmp_path / "a.exr")
-    expected = values.astype(np.float16).astype(np.float32) if half else values
-    assert pixels.dtype == np.float32
+    expected = values.astype(np.float16) if half else values
+    assert pixels.dtype == expected.dtype
     np.testing.assert_array_equal(pixels, np.moveaxis(expected, 0, 2))
 
 

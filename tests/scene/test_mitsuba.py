@@ -448,6 +448,23 @@ def test_references_may_come_first_and_nested_ones_are_copied(load_xml):
     assert [bsdf.name for bsdf in scene.bsdfs] == ["later"]
 
 
+def test_scaled_textures(load_xml):
+    """The `scale` texture of Mitsuba 0.x, around a bitmap that has a name, a checkerboard, and itself."""
+    body = '<texture type="bitmap" id="t"><string name="filename" value="colours.png"/></texture>'
+    scale = '<texture type="scale" name="reflectance"><float name="scale" value="0.5"/>{}</texture>'
+    kinds = {
+        "bitmap": '<ref id="t"/>',
+        "checkerboard": '<texture type="checkerboard"><rgb name="color0" value="0.1 0.2 0.3"/></texture>',
+        "nested": scale.format('<ref id="t"/>').replace(' name="reflectance"', ""),
+    }
+    body += "".join(on_shape(f'<bsdf type="diffuse">{scale.format(child)}</bsdf>') for child in kinds.values())
+    bitmap, checkers, nested = (shape.bsdf.reflectance for shape in load_xml(body).shapes)
+    assert (bitmap.scale, nested.scale, bitmap.name) == (0.5, 0.25, "")
+    assert (checkers.color0, checkers.color1) == ([0.05, 0.1, 0.15], 0.1)
+    with pytest.raises(SceneError, match="needs one texture and a number"):
+        load_xml(on_shape(f'<bsdf type="diffuse">{scale.format("")}</bsdf>'))
+
+
 def test_named_textures(load_xml):
     body = '<texture type="bitmap" id="t"><string name="filename" value="colours.png"/></texture>'
     body += on_shape('<bsdf type="diffuse"><ref name="reflectance" id="t"/></bsdf>')

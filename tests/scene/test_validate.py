@@ -176,8 +176,9 @@ def moved(*transform, shape=d.Rectangle):
         ),
         (d.Scene(shapes=[d.Mesh(file="/none/a.ply")]), "shapes[0].file: file not found: '/none/a.ply'"),
         (
-            d.Scene(textures=[d.Bitmap(file="/none/a.tif")]),
-            "textures[0].file: unknown image format '.tif' of '/none/a.tif'; allowed: .png, .jpg, .jpeg, .exr, .hdr",
+            d.Scene(textures=[d.Bitmap(file="/none/a.psd")]),
+            "textures[0].file: unknown image format '.psd' of '/none/a.psd'; "
+            "allowed: .png, .jpg, .jpeg, .bmp, .tga, .tif, .tiff, .exr, .hdr",
         ),
         (
             with_bsdfs(d.Diffuse(reflectance=d.Bitmap(file="/none/a.png"))),
@@ -207,7 +208,7 @@ def moved(*transform, shape=d.Rectangle):
         (
             d.Scene(emitters=[d.Envmap(file=__file__)]),
             f"emitters[0].file: unknown image format '.py' of {shown(__file__)}; "
-            "allowed: .png, .jpg, .jpeg, .exr, .hdr",
+            "allowed: .png, .jpg, .jpeg, .bmp, .tga, .tif, .tiff, .exr, .hdr",
         ),
         (
             d.Scene(emitters=[d.Envmap(file=TILES, to_world=[d.TransformStep(scale=(1.0, 2.0, 1.0))])]),

@@ -212,6 +212,8 @@ class _Writer:
         return float(value) if scalar else _colour(value)
 
     def _bitmap(self, bitmap, scalar):
+        if bitmap.scale != 1.0:
+            raise WavefrontError(f"{bitmap.file}: Mitsuba has no scale of a bitmap")
         is_float = bitmap.file.lower().endswith(".exr")
         if is_float and bitmap.color_space == "srgb":
             raise WavefrontError(f"{bitmap.file}: Mitsuba takes no OpenEXR image as sRGB")

@@ -32,6 +32,7 @@ class EnvironmentMap:
     scale: wp.float32
     to_world: wp.mat33  # orthogonal
     bytes: wp.array[wp.uint8]  # pixels of an 8-bit file, sRGB-encoded; or
+    halves: wp.array[wp.float16]  # pixels of a file of halves; or
     floats: wp.array[wp.float32]  # pixels of any other file
     srgb_to_linear: wp.array[wp.float32]  # 256 entries, beside bytes
     rows: wp.array[wp.float32]  # upper end of the cumulative probability of each row of cells, [height - 1]
@@ -67,12 +68,16 @@ def cell_weights(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         Mean luminance of the cells, [height - 1, width], and the solid angle of a cell of each row, [height - 1].
     """
-    rgb = np.asarray(LUMINANCE)
-    luminance = pixels[:, :, 0].astype(np.float64) if pixels.shape[2] == 1 else pixels.astype(np.float64) @ rgb
+    luminance = pixels[:, :, 0].astype(np.float64) if pixels.shape[2] == 1 else _luminances(pixels)
     luminance[luminance <= 1e-30] = 0.0
     across = luminance + np.roll(luminance, -1, axis=1)
     cosines = np.cos(np.linspace(0.0, np.pi, len(pixels)))
     return 0.25 * (across[:-1] + across[1:]), (cosines[:-1] - cosines[1:]) * 2.0 * np.pi / pixels.shape[1]
+
+
+def _luminances(pixels: np.ndarray) -> np.ndarray:
+    """In float64, channel by channel: no copy of all pixels in that type."""
+    return sum(np.multiply(pixels[:, :, i], weight, dtype=np.float64) for i, weight in enumerate(LUMINANCE))
 
 
 @wp.func
@@ -105,12 +110,18 @@ def luminance(rgb: wp.vec3) -> float:
     return wp.dot(rgb, wp.static(wp.vec3(*LUMINANCE)))
 
 
+def envmap_storage(light_kinds: tuple[str, ...]) -> str | None:
+    """How the pixels of a scene's environment map are stored, from the names of its kinds of light; None: no map."""
+    found = [kind.removeprefix("envmap_") for kind in light_kinds if kind.startswith("envmap_")]
+    return found[0] if found else None
+
+
 @functools.cache
-def make_envmap(in_bytes: bool, density: bool = True):
+def make_envmap(storage: str | None, density: bool = True):
     """Functions for an environment map.
 
     Args:
-        in_bytes: The pixels are 8-bit.
+        storage: ``bytes``, ``halves`` or ``floats``; None where the functions are not called.
         density: Evaluate the density too, else it is 0 and the map needs no tables.
 
     Returns:
@@ -122,12 +133,17 @@ def make_envmap(in_bytes: bool, density: bool = True):
     def fetch(env: EnvironmentMap, x: int, y: int) -> wp.vec3:
         i = (y * env.width + x) * env.channels
         rgb = wp.vec3(0.0)
-        if wp.static(in_bytes):
+        if wp.static(storage == "bytes"):
             r = env.srgb_to_linear[wp.int32(env.bytes[i])]
             rgb = wp.vec3(r)
             if env.channels == 3:
                 g = env.srgb_to_linear[wp.int32(env.bytes[i + 1])]
                 rgb = wp.vec3(r, g, env.srgb_to_linear[wp.int32(env.bytes[i + 2])])
+        elif wp.static(storage == "halves"):
+            grey = float(env.halves[i])
+            rgb = wp.vec3(grey)
+            if env.channels == 3:
+                rgb = wp.vec3(grey, float(env.halves[i + 1]), float(env.halves[i + 2]))
         else:
             grey = env.floats[i]
             rgb = wp.vec3(grey)

@@ -8,13 +8,14 @@ import warp as wp
 
 from wavefront.accel.mesh_query import INFINITE, Geometry
 from wavefront.light.delta import spot_falloff
-from wavefront.light.envmap import make_envmap
+from wavefront.light.envmap import envmap_storage, make_envmap
 from wavefront.light.sun import sample_sun
 from wavefront.light.tables import (
     KIND_CONSTANT,
     KIND_DIRECTIONAL,
     KIND_ENVMAP_BYTES,
     KIND_ENVMAP_FLOATS,
+    KIND_ENVMAP_HALVES,
     KIND_POINT,
     KIND_SPHERE,
     KIND_SPOT,
@@ -85,8 +86,10 @@ def make_light_sampler(kinds: tuple[str, ...], textures: tuple[str, ...]):
     has_triangle = "triangle" in kinds
     has_sphere = "sphere" in kinds
     has_constant = "constant" in kinds
-    has_envmap = "envmap_bytes" in kinds or "envmap_floats" in kinds
-    eval_envmap, sample_envmap = make_envmap("envmap_bytes" in kinds)
+    storage = envmap_storage(kinds)
+    has_envmap = storage is not None
+    envmap_kind = {"bytes": KIND_ENVMAP_BYTES, "halves": KIND_ENVMAP_HALVES}.get(storage, KIND_ENVMAP_FLOATS)
+    eval_envmap, sample_envmap = make_envmap(storage)
     has_directional = "directional" in kinds
     has_point = "point" in kinds or "spot" in kinds
     has_spot = "spot" in kinds
@@ -188,7 +191,7 @@ def make_light_sampler(kinds: tuple[str, ...], textures: tuple[str, ...]):
                 result.pdf = light.pmf * sphere_pdf()
                 result.L = lights.emitters[light.emitter].radiance
         if wp.static(has_envmap):
-            if light.kind == KIND_ENVMAP_BYTES or light.kind == KIND_ENVMAP_FLOATS:
+            if light.kind == wp.static(envmap_kind):
                 result.wi = sample_envmap(lights.envmap, wp.vec3(u[1], u[2], u[3]))
                 # Radiance and density of the rounded direction: what a ray that escapes in it will find.
                 found = eval_envmap(lights.envmap, result.wi)

@@ -16,6 +16,7 @@ KIND_DIRECTIONAL = wp.constant(5)
 KIND_POINT = wp.constant(6)
 KIND_SPOT = wp.constant(7)
 KIND_SUN = wp.constant(8)
+KIND_ENVMAP_HALVES = wp.constant(9)
 KINDS = {
     "triangle": 0,
     "sphere": 1,
@@ -26,10 +27,11 @@ KINDS = {
     "point": 6,
     "spot": 7,
     "sun": 8,
+    "envmap_halves": 9,
 }
 DELTA = ("directional", "point", "spot")  # those that no ray can find
 AREA = ("triangle", "sphere")  # those that are shapes
-ENVIRONMENT = ("constant", "envmap_bytes", "envmap_floats")  # of which a scene has one at most
+ENVIRONMENT = ("constant", "envmap_bytes", "envmap_halves", "envmap_floats")  # of which a scene has one at most
 
 
 @wp.struct

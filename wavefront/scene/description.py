@@ -70,7 +70,7 @@ IDENTITY_UV = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 
 
 class Bitmap(Record, tag_field="type", tag="bitmap"):
-    """An image file: PNG or JPEG (8 bit), OpenEXR, or Radiance HDR."""
+    """An image file: PNG or TIFF (8 or 16 bit, TIFF also float), JPEG, BMP, TGA, OpenEXR, or Radiance HDR."""
 
     file: Annotated[str, Meta(description="Path of the image, relative to the scene file.", min_length=1)]
     name: str = ""
@@ -83,8 +83,11 @@ class Bitmap(Record, tag_field="type", tag="bitmap"):
     ] = None
     color_space: Annotated[
         Literal["auto", "srgb", "linear"],
-        Meta(description="How values are encoded; auto: 8-bit colours are sRGB, all else is linear."),
+        Meta(description="How values are encoded; auto: colours of 8 or 16 bit are sRGB, all else is linear."),
     ] = "auto"
+    scale: Annotated[
+        NonNegative | RGB, Meta(description="Multiplies the (linear) values; a colour those of the same channel.")
+    ] = 1.0
     filter: Literal["bilinear", "nearest"] = "bilinear"
     wrap: Literal["repeat", "mirror", "clamp"] = "repeat"
     uv_transform: UVTransform = IDENTITY_UV
@@ -338,7 +341,7 @@ class Envmap(Record, tag_field="type", tag="envmap"):
 
     file: Annotated[
         str,
-        Meta(description="OpenEXR, Radiance HDR, PNG or JPEG (8 bit, sRGB), relative to the scene file.", min_length=1),
+        Meta(description="An image as of a bitmap; integers are sRGB. Relative to the scene file.", min_length=1),
     ]
     name: str = ""
     scale: Annotated[NonNegative, Meta(description="Multiplies the image.")] = 1.0

@@ -13,6 +13,7 @@ from wavefront.film import LUMINANCE
 from wavefront.light.tables import EmitterRecord, LightTables
 from wavefront.scene import description
 from wavefront.scene.light_upload import LightUpload
+from wavefront.scene.lookup import shown
 from wavefront.scene.material_upload import MaterialUpload
 from wavefront.scene.meshes import clear_cache, tessellate
 from wavefront.scene.texture_upload import TextureAtlas, struct_array
@@ -96,6 +97,7 @@ class _Upload:
         meshes, spheres = [], []
         for i, shape in enumerate(self.scene.shapes):
             where = f"shapes[{i}]"
+            named = where + (f" ({shown(shape.name)})" if shape.name else "")
             emitter = self._emitter(shape.emitter, where) if shape.emitter is not None else -1
             record = {"material": self.materials.add(shape.bsdf, f"{where}.bsdf"), "first_light": -1}
             record["two_sided"] = int(shape.emitter is not None and shape.emitter.two_sided)
@@ -108,7 +110,11 @@ class _Upload:
             else:
                 mesh = tessellate(shape, where)
                 if mesh.dropped:
-                    self.notes.append(f"{where}: {mesh.dropped} triangles without area are left out")
+                    self.notes.append(f"{named}: {mesh.dropped} triangles without area are left out")
+                textured = record["material"] in self.materials.textured
+                textured |= emitter >= 0 and self.emitters[emitter]["radiance_texture"] >= 0
+                if textured and mesh.uvs is None:
+                    self.notes.append(f"{named} has no UVs: its textures are looked up at (0, 0)")
                 record["smooth"] = int(mesh.normals is not None)
                 meshes.append((record, mesh, emitter))
         clear_cache()

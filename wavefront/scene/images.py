@@ -1,4 +1,4 @@
-"""Image files to arrays and back: Pillow for 8-bit images, OpenEXR for floating point, OpenImageIO for Radiance HDR."""
+"""Image files to arrays and back: Pillow for 8-bit images, OpenEXR for EXR, OpenImageIO for all else."""
 
 from __future__ import annotations
 
@@ -44,42 +44,58 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
 # --- reading ---------------------------------------------------------------------------------------------------
 
 
-def load_image(path: str | os.PathLike, where: str = "") -> np.ndarray:
+def load_image(path: str | os.PathLike, where: str = "", alpha: bool = False) -> np.ndarray:
     """Pixels of an image file, first row on top, as encoded (no colour conversion).
 
-    8-bit images give uint8; OpenEXR, Radiance HDR and 16-bit grey PNG give float32 (16-bit scaled to [0, 1]). Alpha is
-    dropped (colours are not premultiplied by it), palettes are expanded, CMYK and other modes become RGB. Pillow
-    reads 16-bit colour PNG with 8 bits.
+    The type is that of the file: 8-bit images give uint8 and 16-bit ones uint16, for 0 to 1; OpenEXR images of halves
+    give float16, other floats float32. Radiance HDR gives float16 where that holds every value exactly. Alpha is
+    dropped (colours are not premultiplied by it), palettes are expanded, CMYK and other modes become RGB.
 
     Args:
         path: The file.
         where: Record path that an error names, such as ``textures[0].file``.
+        alpha: The alpha channel in place of the colours; where there is none, it is 1.
 
     Returns:
-        (H, W, C) uint8 or float32, C is 1 or 3.
+        (H, W, C) of one of these types, C is 1 or 3.
 
     Raises:
-        SceneError: Missing or unreadable file, or an EXR without R, G, B or a single channel.
+        SceneError: Missing or unreadable file, or one without R, G, B or a single channel.
     """
     path = Path(path)
     if not path.exists():
         raise SceneError(f"{path}: file not found", path=where)
     if not path.is_file():
         raise SceneError(f"{path}: not a file", path=where)
-    load = {".exr": _load_exr, ".hdr": _load_hdr}.get(path.suffix.lower(), _load_pillow)
-    pixels = load(path, where)
+    suffix = path.suffix.lower()
+    if suffix == ".exr":
+        pixels = _load_exr(path, where, alpha)
+    elif suffix in (".hdr", ".tif", ".tiff") or (suffix == ".png" and _is_16_bit_png(path)):
+        pixels = _load_oiio(path, where, alpha)
+    else:
+        pixels = _load_pillow(path, where, alpha)
     if not pixels.size:
         raise SceneError(f"{path}: the image has no pixels", path=where)
+    if suffix == ".hdr":  # 8-bit mantissas, but exponents that may be out of range
+        with np.errstate(over="ignore"):
+            halves = pixels.astype(np.float16)
+        if np.array_equal(halves, pixels):
+            pixels = halves
     return np.ascontiguousarray(pixels)
 
 
-def _load_pillow(path, where):
+def _is_16_bit_png(path):
+    """From the header: Pillow would read 16-bit colours with 8 bits."""
+    with open(path, "rb") as file:
+        head = file.read(25)
+    return head[12:16] == b"IHDR" and head[24:] == b"\x10"
+
+
+def _load_pillow(path, where, alpha):
     try:
         with Image.open(path) as image:
-            if image.mode.startswith("I;16") or image.mode == "I":
-                return (np.asarray(image, np.float32) / np.float32(65535.0))[:, :, None]
-            if image.mode == "F":
-                return np.asarray(image, np.float32)[:, :, None]
+            if alpha:
+                return np.asarray(image.convert("RGBA").getchannel("A"), np.uint8)[:, :, None]
             grey = image.mode in ("1", "L", "LA", "La")
             if image.mode == "P" and image.palette is not None and image.palette.mode in ("L", "LA"):
                 grey = True
@@ -90,32 +106,49 @@ def _load_pillow(path, where):
     return pixels[:, :, None] if pixels.ndim == 2 else pixels
 
 
-def _load_exr(path, where):
+def _load_exr(path, where, alpha):
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = {name: np.asarray(channel.pixels, np.float32) for name, channel in file.channels().items()}
+            channels = {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
     except Exception as error:  # the binding raises RuntimeError, ValueError and others
         text = " ".join(str(error).split()) or "not an OpenEXR file"
         raise SceneError(f"{path}: cannot be read: {text}", path=where) from None
-    colours = [name for name in channels if name != "A"]
+    if alpha:
+        first = next(iter(channels.values()))
+        channels = {"A": channels.get("A", np.ones_like(first))}
+    colours = [name for name in channels if name != "A" or alpha]
     if all(name in channels for name in "RGB"):
-        return np.stack([channels[name] for name in "RGB"], axis=2)
-    if "Y" in channels:
-        return channels["Y"][:, :, None]
-    if len(colours) == 1:
-        return channels[colours[0]][:, :, None]
-    raise SceneError(f"{path}: has channels {', '.join(channels)}; needed: R, G, B, or one channel", path=where)
+        colours = ["R", "G", "B"]
+    elif "Y" in channels:
+        colours = ["Y"]
+    if len(colours) not in (1, 3) or (len(colours) == 3 and colours != ["R", "G", "B"]):
+        raise SceneError(f"{path}: has channels {', '.join(channels)}; needed: R, G, B, or one channel", path=where)
+    pixels = np.stack([channels[name] for name in colours], axis=2)
+    return pixels if pixels.dtype == np.float16 else pixels.astype(np.float32, copy=False)
 
 
-def _load_hdr(path, where):
+def _load_oiio(path, where, alpha):
     import OpenImageIO  # only here: hardly any scene needs it
 
-    image = OpenImageIO.ImageInput.open(str(path))
-    pixels = image.read_image(0, 0, 0, image.spec().nchannels, OpenImageIO.FLOAT) if image else None
+    config = OpenImageIO.ImageSpec()
+    config.attribute("oiio:UnassociatedAlpha", 1)  # colours as they are in the file
+    image = OpenImageIO.ImageInput.open(str(path), config)
+    pixels = None
+    if image:
+        spec = image.spec()
+        if spec.nchannels > 4:
+            raise SceneError(f"{path}: has {spec.nchannels} channels; needed: one or three, and alpha", path=where)
+        kind = spec.format.basetype
+        kept = {OpenImageIO.UINT8: OpenImageIO.UINT8, OpenImageIO.UINT16: OpenImageIO.UINT16}
+        pixels = image.read_image(0, 0, 0, spec.nchannels, kept.get(kind, OpenImageIO.FLOAT))
     if pixels is None:
-        text = " ".join((image or OpenImageIO).geterror().split()) or "not a Radiance HDR file"
+        text = " ".join((image or OpenImageIO).geterror().split()) or "not an image"
         raise SceneError(f"{path}: cannot be read: {text}", path=where)
-    return np.asarray(pixels, np.float32)
+    if alpha:
+        opaque = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1
+        found = image.spec().alpha_channel
+        return pixels[:, :, found : found + 1] if found >= 0 else np.full_like(pixels[:, :, :1], opaque)
+    return pixels[:, :, : 3 if pixels.shape[2] >= 3 else 1]
 
 
 # --- writing ---------------------------------------------------------------------------------------------------

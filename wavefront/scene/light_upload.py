@@ -115,27 +115,29 @@ class LightUpload:
 
     def _envmap(self, emitter: description.Envmap, where: str, cross_section: float) -> None:
         pixels = _load_envmap(emitter.file, where, self.notes)
-        in_bytes = pixels.dtype == np.uint8
-        linear = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
-        means, solid_angles = cell_weights(linear[pixels] if in_bytes else pixels)
+        matrix = to_matrix(emitter.to_world, f"{where}.to_world")[:3, :3]
+        self._map(pixels, emitter.scale, matrix, cross_section)
+
+    def _map(self, pixels: np.ndarray, scale: float, matrix: np.ndarray, cross_section: float) -> None:
+        """The environment map with these pixels, in the orientation of the similarity `matrix`."""
         env = EnvironmentMap()
         env.height, env.width, env.channels = pixels.shape
-        env.scale = emitter.scale
-        matrix = to_matrix(emitter.to_world, f"{where}.to_world")[:3, :3]
+        env.scale = scale
         u, _, vt = np.linalg.svd(matrix)  # a uniform scale has no meaning, and roundings are taken off
         env.to_world = wp.mat33((u @ vt).astype(np.float32))
-        if in_bytes:
-            env.bytes = wp.array(pixels.ravel(), dtype=wp.uint8, device=self.device)
+        storage = {np.dtype(np.uint8): "bytes", np.dtype(np.float16): "halves"}.get(pixels.dtype, "floats")
+        setattr(env, storage, wp.array(pixels.ravel(), device=self.device))
+        if storage == "bytes":
+            linear = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
             env.srgb_to_linear = wp.array(linear, dtype=wp.float32, device=self.device)
-        else:
-            env.floats = wp.array(pixels.ravel(), dtype=wp.float32, device=self.device)
+            pixels = linear[pixels]
+        means, solid_angles = cell_weights(pixels)
         row_sums = means.sum(axis=1) * solid_angles
         if self.scene.integrator.nee:
             env.rows = wp.array(quantized_cdf(row_sums), dtype=wp.float32, device=self.device)
             env.columns = wp.array(quantized_cdf(means), dtype=wp.float32, device=self.device)
         self.tables.envmap = env
-        power = cross_section * emitter.scale * row_sums.sum()
-        self.tables.environment = self._add("envmap_bytes" if in_bytes else "envmap_floats", power, -1)
+        self.tables.environment = self._add(f"envmap_{storage}", cross_section * scale * row_sums.sum(), -1)
 
     # --- lights without extent, and suns -----------------------------------------------------------------------------
 
@@ -178,7 +180,7 @@ def _unit(vector) -> np.ndarray:
 
 
 def _load_envmap(file: str, where: str, notes: list[str]) -> np.ndarray:
-    """Pixels of an environment map, [height, width, 1 or 3], uint8 or float32, finite and not negative."""
+    """Pixels of an environment map, [height, width, 1 or 3], uint8, float16 or float32, finite and not negative."""
     where = f"{where}.file"
     pixels = load_image(file, where)
     height, width, _ = pixels.shape
@@ -188,6 +190,8 @@ def _load_envmap(file: str, where: str, notes: list[str]) -> np.ndarray:
         raise SceneError(f"{file}: an environment map of {width}x{height} pixels is too large", path=where)
     if pixels.dtype == np.uint8:
         return pixels
+    if pixels.dtype == np.uint16:
+        return srgb_to_linear(pixels / 65535.0).astype(np.float32)
     wrong = ~np.isfinite(pixels)
     if wrong.any():
         y, x, _ = np.argwhere(wrong)[0]
@@ -195,7 +199,7 @@ def _load_envmap(file: str, where: str, notes: list[str]) -> np.ndarray:
     negative = (pixels < 0.0).any(axis=2)
     if negative.any():
         notes.append(f"{where}: {negative.sum()} pixels of {file} have negative radiance, which is taken as 0")
-        pixels = np.maximum(pixels, np.float32(0.0))
+        pixels = np.maximum(pixels, 0)
     return pixels
 
 

@@ -75,6 +75,7 @@ class MaterialUpload:
         self.coatings: list[np.ndarray] = []
         self.kinds: set[str] = set()
         self.known: dict[int, int] = {}
+        self.textured: set[int] = set()  # materials that look textures up
         self.mask = False
         self.tangents = False  # whether some BSDF depends on the direction of its tangent
         self.keep_alive: list = []
@@ -109,6 +110,7 @@ class MaterialUpload:
         bsdf = resolve_bsdf(self.scene, ref)
         if id(bsdf) in self.known:
             return self.known[id(bsdf)]
+        references = self.atlas.references
         material = {"opacity": 1.0, "opacity_texture": -1}
         inner = bsdf
         if isinstance(inner, description.Mask):
@@ -127,6 +129,8 @@ class MaterialUpload:
             sides = [front, front if transmits else (int(bsdf_tables.KIND_NONE), 0)]
         (material["front"], material["front_index"]), (material["back"], material["back_index"]) = sides
         self.materials.append(material)
+        if self.atlas.references > references:
+            self.textured.add(len(self.materials) - 1)
         self.known[id(bsdf)] = len(self.materials) - 1
         self.keep_alive.append(bsdf)  # the id stays taken
         return len(self.materials) - 1

@@ -308,7 +308,23 @@ class Materials:
             record = description.Checkerboard(**colours, uv_transform=_uv_transform(plugin))
             plugin.finish()
             return record
-        raise plugin.error(f"{plugin.label()} is not supported; supported: bitmap, checkerboard, uniform")
+        if plugin.type == "scale":
+            return self._scale(plugin, scalar)
+        raise plugin.error(f"{plugin.label()} is not supported; supported: bitmap, checkerboard, scale, uniform")
+
+    def _scale(self, plugin, scalar):
+        """Of Mitsuba 0.x: another texture times a number."""
+        nested = plugin.objects("texture")
+        factor = self.scalar(plugin, "scale", 1.0)
+        plugin.finish("texture")
+        if len(nested) != 1 or not isinstance(factor, float):
+            raise plugin.error(f"{plugin.label()} needs one texture and a number")
+        record = self._convert_texture(nested[0], scalar)
+        if isinstance(record, description.Bitmap):
+            record.scale *= factor
+        else:
+            record.color0, record.color1 = (_scaled(plugin, c, factor) for c in (record.color0, record.color1))
+        return record
 
     def _bitmap(self, plugin, scalar):
         element = plugin.get("filename")

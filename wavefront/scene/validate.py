@@ -16,7 +16,7 @@ from wavefront.scene.transforms import to_matrix
 
 GLTF_SUFFIXES = (".gltf", ".glb")
 MESH_SUFFIXES = (".ply", ".obj", *GLTF_SUFFIXES)
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".hdr")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff", ".exr", ".hdr")
 _REFLECTING = ("diffuse", "oren_nayar", "conductor", "rough_conductor", "plastic", "rough_plastic", "principled")
 _LARGEST = float(np.finfo(np.float32).max)
 
@@ -39,7 +39,8 @@ def validate(
             if hasattr(record, "alpha_u"):
                 _check_roughness(record, path)
             if isinstance(record, (description.Bitmap, description.Envmap)):
-                _check_file(record.file, IMAGE_SUFFIXES, "image", f"{path}.file")
+                embedded = getattr(record, "image", None) is not None
+                _check_file(record.file, GLTF_SUFFIXES if embedded else IMAGE_SUFFIXES, "image", f"{path}.file")
             elif isinstance(record, (description.Conductor, description.RoughConductor)):
                 _check_conductor(record, path)
             elif hasattr(record, "int_ior"):

@@ -6,7 +6,7 @@ import functools
 
 import warp as wp
 
-from wavefront.light.envmap import make_envmap
+from wavefront.light.envmap import envmap_storage, make_envmap
 from wavefront.light.mis import power_heuristic
 from wavefront.light.sun import in_sun
 from wavefront.light.tables import LightTables
@@ -20,8 +20,9 @@ def make_escaped(escape_lights: tuple[str, ...], light_sampling: bool):
     """Kernel of the stage; the arguments are the properties of `Features` of the same name."""
     has_constant = "constant" in escape_lights
     has_sun = "sun" in escape_lights
-    has_envmap = "envmap_bytes" in escape_lights or "envmap_floats" in escape_lights
-    eval_envmap, _ = make_envmap("envmap_bytes" in escape_lights, density=light_sampling)
+    storage = envmap_storage(escape_lights)
+    has_envmap = storage is not None
+    eval_envmap, _ = make_envmap(storage, density=light_sampling)
 
     @wp.kernel(enable_backward=False, module="unique")
     def add_environment(
