@@ -1,8 +1,8 @@
 """Converts a scene to our JSON format: ``python -m tools.convert scene.xml out.json``.
 
-Meshes are written as binary PLY to ``<out>_meshes/`` and textures are copied or extracted to ``<out>_textures/``, both beside the
-JSON file, which refers to them by relative path. Everything is written under temporary names first, and the JSON file
-is put in place last, so that an error leaves nothing half-written.
+Meshes are written as binary PLY to ``<out>_meshes/`` and textures are copied (out of a glTF file, too) to
+``<out>_textures/``, both beside the JSON file, which refers to them by relative path. Everything is written under
+temporary names first, and the JSON file is put in place last, so that an error leaves nothing half-written.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("scene", help="the scene to convert: Mitsuba XML, glTF, or our JSON")
     parser.add_argument("out", help="the JSON file to write")
     parser.add_argument("-D", dest="parameters", action="append", default=[], metavar="NAME=VALUE",
-                        help="a value for $NAME in a Mitsuba scene, camera or scene in a glTF file; may be repeated")  # fmt: skip
+                        help="a value for $NAME of a Mitsuba scene; camera or scene of a glTF file")  # fmt: skip
     parser.add_argument("--quiet", action="store_true", help="print no warnings")
     options = parser.parse_args(arguments)
     try:

@@ -86,7 +86,11 @@ def build_parser() -> argparse.ArgumentParser:
         "--set", action="append", default=[], metavar="PATH=VALUE", help="change any key, as in integrator.max_depth=6"
     )
     sampling.add_argument(
-        "--define", action="append", default=[], metavar="NAME=VALUE", help="value of a $NAME of a Mitsuba scene; camera=NAME or scene=NAME of a glTF file"
+        "--define",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="value of a $NAME of a Mitsuba scene; camera=NAME or scene=NAME of a glTF file",
     )
 
     machine = parser.add_argument_group("machine")

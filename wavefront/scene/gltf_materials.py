@@ -43,15 +43,15 @@ class Materials:
         warn: Called with a line of text for what the records cannot say.
 
     Attributes:
-        bsdfs: The records made so far, with names of their own.
+        bsdfs: The records made so far.
+        names: Theirs, no two the same.
     """
 
     def __init__(self, document: Document, warn: Callable[[str], object]):
         self.document, self.warn = document, warn
         self.bsdfs: list[description.Bsdf] = []
         self._known: dict[int | None, Surface] = {}
-        self._names: set[str] = set()
-        self._sets: dict[int, str] = {}
+        self.names: set[str] = set()
 
     def surface(self, index: int | None, where: str) -> Surface:
         """The records of a material to which the place `where` refers; None is the material of the standard.
@@ -62,12 +62,9 @@ class Materials:
         """
         if index not in self._known:
             material = gltf.Material() if index is None else self.document.item("materials", index, where)
-            self._known[index] = _Converter(self, material, f"materials[{index}]").convert()
+            name = material.name or ("default material" if index is None else f"material {index}")
+            self._known[index] = _Converter(self, material, f"materials[{index}]").convert(name)
         return self._known[index]
-
-    def unique_name(self, name: str) -> str:
-        """`name`, or where it is taken, with a number after it."""
-        return unique_name(name, self._names)
 
 
 def unique_name(name: str, taken: set[str]) -> str:
@@ -88,7 +85,8 @@ class _Converter:
         self.extensions = material.extensions
         self.uv_sets: dict[int, str] = {}
 
-    def convert(self) -> Surface:
+    def convert(self, name: str) -> Surface:
+        """The records; `name` is that of the BSDF unless it is taken."""
         material, pbr = self.material, self.material.pbr
         place = f"{self.where}.pbrMetallicRoughness"
         base_color = self._color(pbr.base_color_texture, f"{place}.baseColorTexture", pbr.base_color_factor[:3])
@@ -102,7 +100,7 @@ class _Converter:
         if opacity != 1.0:
             cutoff = material.alpha_cutoff if material.alpha_mode == "MASK" else None
             bsdf = description.Mask(bsdf=bsdf, opacity=opacity, cutoff=cutoff)
-        bsdf.name = self.materials.unique_name(material.name or self.where.replace("s[", " ").rstrip("]"))
+        bsdf.name = unique_name(name, self.materials.names)
         emitter = self._emitter()
         if emitter is not None and opacity != 1.0:
             self._warn(f"alphaMode {material.alpha_mode} does not mask what the material emits")

@@ -100,10 +100,10 @@ class TextureAtlas:
 
         `decode`: floats are sRGB-encoded; they are stored linear.
         """
-        file, source = texture.file, (texture.file, texture.image, texture.channel)
-        if (*source, decode) in self.images:
-            return self.images[*source, decode]
-        stored = self.images.get((*source, not decode))
+        file, key = texture.file, (texture.file, texture.image, texture.channel, decode)
+        if key in self.images:
+            return self.images[key]
+        stored = self.images.get((*key[:-1], not decode))
         if stored is not None and stored[2].dtype.kind == "u":  # integers are stored as encoded
             return stored
         pixels = load_bitmap(texture, where)
@@ -119,9 +119,9 @@ class TextureAtlas:
                 pixels = srgb_to_linear(np.maximum(pixels.astype(np.float64), 0.0)).astype(np.float32)
         kind = next(name for name, dtype in IMAGE_TYPES.items() if dtype == pixels.dtype)
         store = self.pixels[kind]
-        self.images[*source, decode] = kind, sum(part.size for part in store), pixels
+        self.images[key] = kind, sum(part.size for part in store), pixels
         store.append(pixels.ravel())
-        return self.images[*source, decode]
+        return self.images[key]
 
     def _append(self, kind: str, record: dict, mean: np.ndarray):
         self.records.append(record)
