@@ -58,6 +58,7 @@ CHANGES = [
     {"lights": ("sun",), "nee": False},
     {"nee": False, "filter": "tent", "mask": False, "tangents": False},
     {"bsdfs": ("conductor",), "roulette": False, "filter": "box"},
+    {"bsdfs": ("principled",)},
     {"bsdfs": ("dielectric",), "aovs": ("albedo",), "variance": False},
 ]
 

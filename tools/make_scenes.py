@@ -33,6 +33,7 @@ from wavefront.scene.description import (
     PathIntegrator,
     Perspective,
     Plastic,
+    Principled,
     RoughConductor,
     RoughDielectric,
     RoughPlastic,
@@ -71,6 +72,7 @@ def write(folder: Path) -> list[str]:
         "glossy-plates.json": glossy_plates(),
         "glass-caustic.json": glass_caustic(),
         "door-ajar.json": door_scene.door_ajar(folder),
+        "principled-lobes.json": principled_lobes(folder),
         "include/material-stage.json": material_stage(),
         **{f"light-{name}.json": scene for name, scene in light_scenes.scenes(folder).items()},
         **{f"material-{name}.json": scene for name, scene in material_balls(folder).items()},
@@ -231,6 +233,11 @@ def material_balls(folder: Path) -> dict[str, Scene]:
             RoughPlastic(diffuse_reflectance=tiles, alpha=0.15, nonlinear=True),
             None,
         ),
+        "principled": (
+            "the principled BSDF: an image under a lacquer",
+            Principled(base_color=tiles, roughness=0.6, clearcoat=1.0, clearcoat_gloss=0.9),
+            None,
+        ),
         "twosided": (
             "a bowl that is metal outside and diffuse inside",
             TwoSided(front=RoughConductor(material="Au", alpha=0.15), back=Diffuse(reflectance=[0.1, 0.3, 0.6])),
@@ -256,6 +263,36 @@ def _on_stage(folder: Path, what: str, bsdf: Bsdf, shape: Mesh | None) -> Scene:
         film=film(),
         integrator=PathIntegrator(max_depth=12),
         shapes=[subject],
+    )
+
+
+def principled_lobes(folder: Path) -> Scene:
+    """Eight balls; each shows what one parameter of the principled BSDF does."""
+    red, gold, blue = [0.7, 0.1, 0.06], [0.95, 0.7, 0.3], [0.15, 0.3, 0.7]
+    brushed = Checkerboard(color0=0.9, color1=0.0, uv_transform=((2.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    balls = {
+        "plain": Principled(base_color=red, roughness=0.3),
+        "clearcoat": Principled(base_color=red, roughness=0.8, clearcoat=1.0, clearcoat_gloss=1.0),
+        "metal": Principled(base_color=gold, roughness=0.3, metallic=1.0),
+        "brushed metal": Principled(base_color=gold, roughness=0.4, metallic=1.0, anisotropic=brushed),
+        "cloth": Principled(base_color=blue, roughness=1.0, specular=0.1, sheen=1.0, sheen_tint=0.7),
+        "wax": Principled(base_color=[0.85, 0.65, 0.4], roughness=0.6, flatness=1.0, spec_tint=0.8),
+        "half glass": Principled(base_color=blue, roughness=0.2, spec_trans=0.6, eta=1.4),
+        "glass": Principled(base_color=[0.6, 0.9, 0.7], roughness=0.15, spec_trans=1.0, eta=1.5),
+    }
+    shapes = []
+    for i, (name, bsdf) in enumerate(balls.items()):
+        at = (round(-1.2 + 0.8 * (i % 4), 3), 0.36, -0.7 if i < 4 else 0.4)
+        place_at = place(rotate=("x", -90.0), translate=at)
+        shapes.append(Sphere(name=name, radius=0.36, to_world=place_at, bsdf=bsdf))
+    return Scene(
+        description="Eight balls of the principled BSDF: plastic, lacquer, metal, brushed metal (half of the ball); "
+        "cloth, wax, half glass, glass.",
+        include=[str(folder / "include" / "material-stage.json")],
+        camera=Perspective(fov=38.0, to_world=look_at((0, 2.4, 5.0), (0, 0.3, -0.1))),
+        film=film(320, 192),
+        integrator=PathIntegrator(max_depth=12),
+        shapes=shapes,
     )
 
 

@@ -1,9 +1,9 @@
 """Coordinates for the directions of a lobe, in which a narrow or grazing lobe is as wide as any other.
 
-A direction wi is named by the normal m of the microfacet that reflects (or refracts) wo to wi: by the length of its
-slope r = slope / alpha as w = 1 / sqrt(1 + r^2), and by its azimuth b. Both are in [0, 1]. An area element of slopes is
-alpha^2 r dr d(phi) = alpha^2 2 pi dw db / w^3; from slopes to solid angle the Jacobian is taken by finite differences,
-so that no formula is shared with the code under test.
+A direction wi is named by the normal m of the microfacet that reflects (or refracts) wo to wi, its slopes x and y each
+divided by its alpha: by their length r as w = 1 / sqrt(1 + r^2), and by their azimuth b. Both are in [0, 1]. An area
+element of slopes is alpha_x alpha_y r dr d(phi) = alpha_x alpha_y 2 pi dw db / w^3; from slopes to solid angle the
+Jacobian is taken by finite differences, so that no formula is shared with the code under test.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Chart:
     """Directions on the side of wo (index None), or on the other side of a boundary with index n_wi / n_wo."""
 
     wo: np.ndarray
-    alpha: float
+    alpha: np.ndarray  # along x and y
     index: float | None
 
     def _upper(self) -> np.ndarray:
@@ -51,14 +51,14 @@ class Chart:
     def directions(self) -> tuple[np.ndarray, np.ndarray]:
         """Directions at the nodes of all cells, and the solid angle of each; zero where there is no direction."""
         w, b, area = nodes(SHAPE, PER_CELL)
-        slope = self.alpha * np.sqrt((1.0 - w) * (1.0 + w)) / w
-        x, y = slope * np.cos(2.0 * np.pi * b), slope * np.sin(2.0 * np.pi * b)
-        step = 1e-5 * (self.alpha + slope)
+        r = np.sqrt((1.0 - w) * (1.0 + w)) / w
+        x, y = (a * r * f(2.0 * np.pi * b) for a, f in zip(self.alpha, (np.cos, np.sin), strict=True))
+        step = 1e-5 * (self.alpha.min() + np.hypot(x, y))
         wi = self._direction(x, y)
         dx = (self._direction(x + step, y) - self._direction(x - step, y)) / (2.0 * step)[:, None]
         dy = (self._direction(x, y + step) - self._direction(x, y - step)) / (2.0 * step)[:, None]
         jacobian = np.linalg.norm(np.cross(dx, dy), axis=1)
-        solid_angle = np.nan_to_num(jacobian) * area * 2.0 * np.pi * self.alpha**2 / w**3
+        solid_angle = np.nan_to_num(jacobian) * area * 2.0 * np.pi * self.alpha.prod() / w**3
         wi = np.where(np.isfinite(wi), wi, [0.0, 0.0, 1.0]) * [1.0, 1.0, np.sign(self.wo[2])]
         return wi, solid_angle
 
@@ -68,14 +68,14 @@ class Chart:
         i = wi * [1.0, 1.0, np.sign(self.wo[2])]
         i = i[i[:, 2] > 0.0] if self.index is None else self.index * i[i[:, 2] < 0.0]
         h = o + i
-        r2 = (h[:, 0] ** 2 + h[:, 1] ** 2) / (self.alpha * h[:, 2]) ** 2
-        slopes = h[:, :2] * np.sign(h[:, 2:])
-        azimuth = np.mod(np.arctan2(slopes[:, 1], slopes[:, 0]) / (2.0 * np.pi), 1.0)
-        return histogram(1.0 / np.sqrt(1.0 + r2), azimuth, SHAPE)[:-1]
+        x, y = (h[:, :2] / (self.alpha * h[:, 2:])).T
+        azimuth = np.mod(np.arctan2(y, x) / (2.0 * np.pi), 1.0)
+        return histogram(1.0 / np.sqrt(1.0 + x**2 + y**2), azimuth, SHAPE)[:-1]
 
 
-def integrate(name: str, p, wo: np.ndarray, alpha: float, ior: float) -> tuple[np.ndarray, np.ndarray, list[Chart]]:
+def integrate(name: str, p, wo: np.ndarray, alpha, ior: float) -> tuple[np.ndarray, np.ndarray, list[Chart]]:
     """Probability of all cells of all charts; integral of f |cos| per chart and channel; the charts."""
+    alpha = np.broadcast_to(alpha, 2).astype(np.float64)
     charts = [Chart(wo, alpha, None)]
     if name == "rough_dielectric":
         charts.append(Chart(wo, alpha, ior if wo[2] > 0.0 else 1.0 / ior))
