@@ -1,5 +1,7 @@
 """Meshes: geometry against closed forms and Mitsuba's own loaders, files written by hand, errors."""
 
+import math
+
 import numpy as np
 import pytest
 import trimesh
@@ -303,11 +305,34 @@ def test_a_changed_file_is_read_again(tmp_path):
     assert area(meshes.tessellate(shape)) == 50.0
 
 
+NAN = float("nan")
+
+
 def test_degenerate_triangles_are_dropped_and_counted():
     triangle = [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (2.0, 0.0, 0.0)]
     mesh = meshes.tessellate(d.Mesh(vertices=triangle, faces=[(0, 1, 2), (0, 1, 3), (1, 1, 2)]))
     assert mesh.dropped == 2
     np.testing.assert_array_equal(mesh.faces, [(0, 1, 2)])
+
+
+def test_what_cannot_be_rendered_is_counted_by_reason():
+    vertices = [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (NAN, 0.0, 0.0), (0.0, 1e30, 0.0), (1e-20, 0.0, 0.0)]
+    vertices += [(0.0, 1e-20, 0.0), (1e300, 0.0, 0.0), (0.0, 0.0, -1.001e12)]
+    faces = [(0, 1, 2), (0, 0, 1), (0, 1, 3), (3, 4, 1), (4, 1, 2), (0, 5, 6), (7, 1, 2), (8, 1, 2), (2, 1, 0)]
+    uvs = [(0.0, 0.0)] * 8 + [(0.0, NAN)]
+    normals = [(0.0, 0.0, 1.0)] * 7 + [(math.inf, 0.0, 1.0), (0.0, NAN, 0.0)]
+    mesh = meshes.tessellate(d.Mesh(vertices=vertices, faces=faces, uvs=uvs, normals=normals))
+    np.testing.assert_array_equal(mesh.faces, [(0, 1, 2), (2, 1, 0)])
+    assert mesh.dropped == 7
+    assert mesh.notes == (
+        "2 normals that are not finite are replaced by those of the faces",
+        "1 UVs that are not finite are replaced by (0, 0)",
+        "7 triangles are left out (3 with a coordinate that is not finite, 2 that reach beyond 1e+12 m, 1 without "
+        "area, 1 smaller than 1e-13 m)",
+    )
+    for array in (mesh.vertices, mesh.normals, mesh.uvs):
+        assert np.isfinite(array).all()
+    assert np.abs(mesh.vertices).max() == 1.0  # what is left out does not reach the bounds
 
 
 def test_zero_normals_become_those_of_the_faces():
@@ -320,7 +345,6 @@ def test_zero_normals_become_those_of_the_faces():
 # --- errors ----------------------------------------------------------------------------------------------------
 
 TRIANGLE = {"vertices": [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)], "faces": [(0, 1, 2)]}
-NAN = float("nan")
 
 
 @pytest.mark.parametrize(
@@ -333,13 +357,17 @@ NAN = float("nan")
         ({"faces": None}, "s", "needs both vertices and faces"),
         ({"faces": None, "vertices": None}, "s", "found neither"),
         ({"file": "a.ply"}, "s", "found both"),
-        ({"faces": [(0, 0, 1)]}, "s", "empty mesh: all of its triangles have zero area"),
-        ({"vertices": [(0.0, NAN, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)]}, "s.vertices", "vertices[0] is not finite"),
-        ({"vertices": [(0.0, 1e300, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)]}, "s", "leaves the range of 32-bit floats"),
+        ({"faces": [(0, 0, 1)]}, "s", "empty mesh: no triangle can be rendered (1 without area)"),
+        (
+            {"vertices": [(0.0, NAN, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)]},
+            "s",
+            "(1 with a coordinate that is not fin",
+        ),
+        ({"vertices": [(0.0, 1e300, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)]}, "s", "(1 with a coordinate that is not"),
+        ({"vertices": [(0.0, 2e12, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)]}, "s", "(1 that reach beyond 1e+12 m)"),
+        ({"vertices": [(0.0, 0.0, 0.0), (1e-14, 0.0, 0.0), (0.0, 1e-14, 0.0)]}, "s", "(1 smaller than 1e-13 m)"),
         ({"normals": [(0.0, 0.0, 1.0)]}, "s.normals", "1 normals for 3 vertices"),
-        ({"normals": [(0.0, 0.0, NAN)] * 3}, "s.normals", "normals[0] is not finite"),
         ({"uvs": [(0.0, 0.0)] * 4}, "s.uvs", "4 uvs for 3 vertices"),
-        ({"uvs": [(0.0, float("inf"))] * 3}, "s.uvs", "uvs[0] is not finite"),
         ({"to_world": [TransformStep(scale=0.0)]}, "s.to_world", "not invertible"),
     ],
 )
@@ -366,14 +394,14 @@ PLY_FACE = "element face 1\nproperty list uchar int vertex_indices\nend_header\n
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/2\n", "texture coordinates of its faces"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 0 0 1\nf 1//1 2//1 3//1\nf 1 2 3\n", "normals of its faces"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\n", "relative (negative) indices"),
-        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n", "vertices[2] is not finite"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n", "(1 with a coordinate that is not finite)"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 x 0\nf 1 2 3\n", "not a readable OBJ file"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0\nf 1/1 2/1 3/1\n", "uvs do not have 2 numbers each"),
-        ("a.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "all of its triangles have zero area"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no triangle can be rendered (1 without area)"),
         ("a.ply", "not a ply", "not a readable PLY file"),
         ("a.ply", PLY_HEAD + "end_header\n0 0 0\n1 0 0\n0 1 0\n", "empty mesh"),
         ("a.ply", PLY_HEAD + PLY_FACE + "0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "index out of range"),
-        ("a.ply", PLY_HEAD + PLY_FACE + "0 0 0\n1 0 0\n0 inf 0\n3 0 1 2\n", "vertices[2] is not finite"),
+        ("a.ply", PLY_HEAD + PLY_FACE + "0 0 0\n1 0 0\n0 inf 0\n3 0 1 2\n", "(1 with a coordinate that is not finite)"),
         ("a.gltf", "{", "line 1, column 2: not JSON"),
         ("a.gltf", '{"asset": {"version": "2.0"}}', "empty mesh"),
         ("a.glb", "glTF", "not a GLB file"),

@@ -9,13 +9,14 @@ import warp as wp
 
 from wavefront.accel.mesh_query import Geometry, Shape
 from wavefront.bsdf import tables as bsdf_tables
+from wavefront.errors import SceneError
 from wavefront.film import LUMINANCE
 from wavefront.light.tables import EmitterRecord, LightTables
 from wavefront.scene import description
 from wavefront.scene.light_upload import LightUpload
 from wavefront.scene.lookup import shown
 from wavefront.scene.material_upload import MaterialUpload
-from wavefront.scene.meshes import clear_cache, tessellate
+from wavefront.scene.meshes import LARGEST_COORDINATE, SMALLEST_TRIANGLE, clear_cache, tessellate
 from wavefront.scene.texture_upload import TextureAtlas, struct_array
 from wavefront.scene.transforms import to_matrix
 from wavefront.texture import TextureTables
@@ -105,12 +106,16 @@ class _Upload:
                 matrix = to_matrix(shape.to_world, f"{where}.to_world")
                 center = matrix[:3, :3] @ np.asarray(shape.center) + matrix[:3, 3]
                 scale = abs(np.linalg.det(matrix[:3, :3])) ** (1.0 / 3.0)
+                reach = np.abs(center).max() + shape.radius * scale
+                if reach > LARGEST_COORDINATE or shape.radius * scale < SMALLEST_TRIANGLE:
+                    found = f"radius {shape.radius * scale:g} m, reaches {reach:g} m"
+                    limits = f"a radius of at least {SMALLEST_TRIANGLE:g} m within {LARGEST_COORDINATE:g} m"
+                    raise SceneError(f"a sphere that 32-bit rays cannot hit ({found}); allowed: {limits}", path=where)
                 record["flip"] = int(shape.flip_normals)
                 spheres.append((record, center, shape.radius * scale, emitter, matrix[:3, :3] / scale))
             else:
                 mesh = tessellate(shape, where)
-                if mesh.dropped:
-                    self.notes.append(f"{named}: {mesh.dropped} triangles without area are left out")
+                self.notes += [f"{named}: {note}" for note in mesh.notes]
                 textured = record["material"] in self.materials.textured
                 textured |= emitter >= 0 and self.emitters[emitter]["radiance_texture"] >= 0
                 if textured and mesh.uvs is None:

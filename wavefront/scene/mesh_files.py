@@ -203,9 +203,11 @@ def _read_gltf(path, part):
 
 
 def _gltf_part(triangles, matrix):
-    vertices, normals = triangles.vertices @ matrix[:3, :3].T + matrix[:3, 3], triangles.normals
-    if normals is not None:
-        normals = normals @ np.linalg.inv(matrix[:3, :3])
+    normals = triangles.normals
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is counted where it is rendered
+        vertices = triangles.vertices @ matrix[:3, :3].T + matrix[:3, 3]
+        if normals is not None:
+            normals = normals @ np.linalg.inv(matrix[:3, :3])
     faces = triangles.faces[:, ::-1] if is_mirror(matrix) else triangles.faces
     return FileMesh(vertices, faces, normals, triangles.uvs)
 

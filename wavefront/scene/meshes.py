@@ -15,6 +15,11 @@ from wavefront.scene.transforms import is_mirror, to_matrix
 
 DISK_SEGMENTS = 256
 
+# Ray-triangle tests in 32-bit floats multiply three lengths: beyond these, in metres, a triangle is never hit, or at a
+# wrong distance (measured with `wp.mesh_query_ray`).
+LARGEST_COORDINATE = 1e12
+SMALLEST_TRIANGLE = 1e-13
+
 
 @dataclass
 class TriangleMesh:
@@ -25,7 +30,8 @@ class TriangleMesh:
         faces: (M, 3) int32.
         normals: (N, 3) float32, unit length, or None: shade every triangle flat.
         uvs: (N, 2) float32, (0, 0) is the first row of an image, or None.
-        dropped: Triangles left out because they have no area.
+        dropped: Triangles left out because they cannot be rendered.
+        notes: What the user should know: what was left out or replaced, with counts.
     """
 
     vertices: np.ndarray
@@ -33,22 +39,25 @@ class TriangleMesh:
     normals: np.ndarray | None
     uvs: np.ndarray | None
     dropped: int = 0
+    notes: tuple[str, ...] = ()
 
 
 def tessellate(shape: description.AnyShape, where: str = "") -> TriangleMesh:
     """Triangles of a mesh, rectangle, cube or disk, in world space.
 
     The outward side stays outward under a mirroring transform (the winding is turned); normals go by the inverse
-    transpose and are made unit length. Triangles without area are dropped and counted. A file normal of length zero
-    becomes the mean of the face normals around it.
+    transpose and are made unit length. Triangles that cannot be rendered are dropped and counted in a note: those
+    without area, with a coordinate that is not finite or beyond `LARGEST_COORDINATE`, or smaller than
+    `SMALLEST_TRIANGLE`. A file normal of length zero or not finite becomes the mean of the face normals around it, a UV
+    that is not finite becomes (0, 0).
 
     Args:
         shape: The record; file paths absolute.
         where: Record path of the shape, such as ``shapes[3]``.
 
     Raises:
-        SceneError: Missing, unreadable or empty mesh, numbers that are not finite, an index out of range, normals or
-            UVs of the wrong length, a bad transform. Its path starts with `where`.
+        SceneError: Missing, unreadable or empty mesh, an index out of range, normals or UVs of the wrong length, a bad
+            transform. Its path starts with `where`.
     """
     matrix = to_matrix(shape.to_world, f"{where}.to_world")
     if isinstance(shape, description.Mesh):
@@ -63,18 +72,22 @@ def tessellate(shape: description.AnyShape, where: str = "") -> TriangleMesh:
         raise SceneError(f"a {type(shape).__name__.lower()} has no triangles", path=where)
 
     prefix = f"{shape.file}: " if getattr(shape, "file", None) else ""
-    with np.errstate(over="ignore", invalid="ignore"):  # reported by the check below
-        vertices = (vertices @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
-    if not np.isfinite(vertices).all():
-        raise SceneError(f"{prefix}a vertex leaves the range of 32-bit floats after to_world", path=where)
+    notes = []
     if normals is not None:
+        normals = _replaced(normals, "normals", "by those of the faces", notes)
         normals = _scaled(_scaled(normals, axis=1) @ _scaled(np.linalg.inv(matrix[:3, :3])), axis=1)
+    if uvs is not None:
+        uvs = _replaced(uvs, "UVs", "by (0, 0)", notes)
+    with np.errstate(over="ignore", invalid="ignore"):
+        vertices = (vertices @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
     if is_mirror(matrix):
         faces = faces[:, ::-1]
-    kept = _has_area(vertices, faces)
+    vertices, kept, reasons = _renderable(vertices, faces)
     if not kept.any():
-        raise SceneError(f"{prefix}empty mesh: all of its triangles have zero area", path=where)
+        raise SceneError(f"{prefix}empty mesh: no triangle can be rendered ({reasons})", path=where)
     dropped = int(len(faces) - kept.sum())
+    if dropped:
+        notes.append(f"{dropped} triangles are left out ({reasons})")
     faces = np.ascontiguousarray(faces[kept], np.int32)
     if normals is not None:
         normals = _unit_normals(normals, vertices, faces)
@@ -89,6 +102,7 @@ def tessellate(shape: description.AnyShape, where: str = "") -> TriangleMesh:
         None if normals is None else np.ascontiguousarray(normals, np.float32),
         None if uvs is None else np.ascontiguousarray(uvs, np.float32),
         dropped,
+        tuple(notes),
     )
 
 
@@ -155,9 +169,6 @@ def _check(vertices, faces, normals, uvs, names, prefix):
             continue
         if len(array) != len(vertices):
             raise SceneError(f"{prefix}{len(array)} {name} for {len(vertices)} vertices", path=names[name])
-        bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
-        if len(bad):
-            raise SceneError(f"{prefix}{name}[{bad[0]}] is not finite (NaN or infinite)", path=names[name])
     outside = np.flatnonzero(((faces < 0) | (faces >= len(vertices))).any(axis=1))
     if len(outside):
         indices = ", ".join(map(str, faces[outside[0]]))
@@ -165,11 +176,36 @@ def _check(vertices, faces, normals, uvs, names, prefix):
         raise SceneError(prefix + message, path=names["faces"])
 
 
-def _has_area(vertices, faces):
-    """Which triangles have an area greater than zero, in float64 of the float32 vertices: (M,) bool."""
-    corners = vertices.astype(np.float64)[faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return (cross != 0.0).any(axis=1)
+def _replaced(array, name, by, notes):
+    """A copy in which rows with a number that does not fit a float32 are zero; `notes` gets their count."""
+    with np.errstate(over="ignore"):
+        bad = ~np.isfinite(array.astype(np.float32)).all(axis=1)
+    if bad.any():
+        notes.append(f"{bad.sum()} {name} that are not finite are replaced {by}")
+        array = np.where(bad[:, None], 0.0, array)
+    return array
+
+
+def _renderable(vertices, faces):
+    """Which triangles can be rendered, (M,) bool, and in words how many cannot and why.
+
+    The vertices come back with those that no such triangle may use moved onto others: they must not reach bounds or the
+    acceleration structure.
+    """
+    finite = np.isfinite(vertices).all(axis=1)
+    near = finite & (np.abs(np.where(finite[:, None], vertices, 0.0)) <= LARGEST_COORDINATE).all(axis=1)
+    wanted = near[faces].all(axis=1)
+    counts = {"with a coordinate that is not finite": ~finite[faces].all(axis=1)}
+    counts[f"that reach beyond {LARGEST_COORDINATE:g} m"] = ~(wanted | counts["with a coordinate that is not finite"])
+    vertices = np.where(near[:, None], vertices, vertices[faces[wanted][0, 0]] if wanted.any() else 0.0)
+    corners = vertices.astype(np.float64)[faces]  # in which the cross product of float32 numbers does not underflow
+    edges = corners[:, 1:] - corners[:, :1]
+    area = (np.cross(edges[:, 0], edges[:, 1]) != 0.0).any(axis=1)
+    small = np.abs(edges).max(axis=(1, 2)) < SMALLEST_TRIANGLE
+    counts["without area"] = wanted & ~area
+    counts[f"smaller than {SMALLEST_TRIANGLE:g} m"] = wanted & area & small
+    reasons = ", ".join(f"{which.sum()} {why}" for why, which in counts.items() if which.any())
+    return vertices, wanted & area & ~small, reasons
 
 
 def _unit_normals(normals, vertices, faces):

@@ -12,6 +12,7 @@ from wavefront.errors import SceneError
 from wavefront.scene import description
 from wavefront.scene.ior import CONDUCTORS, INDEX_OF_REFRACTION
 from wavefront.scene.lookup import BSDF_FIELDS, NUMBER_FIELDS, TEXTURE_FIELDS, shown, unknown_name, walk
+from wavefront.scene.meshes import LARGEST_COORDINATE
 from wavefront.scene.transforms import to_matrix
 
 GLTF_SUFFIXES = (".gltf", ".glb")
@@ -57,7 +58,9 @@ def validate(
                 _fail(
                     f"shapes[{i}].to_world", "a sphere can be scaled uniformly only; found different scales or a shear"
                 )
-        _check_transform(scene.camera.to_world, "camera.to_world")
+        matrix = _check_transform(scene.camera.to_world, "camera.to_world")
+        if matrix is not None and np.abs(matrix[:3, 3]).max() > LARGEST_COORDINATE:
+            _fail("camera.to_world", f"the camera is beyond {LARGEST_COORDINATE:g} m, where 32-bit rays hit nothing")
         _check_emitters(scene)
         for i, aov in enumerate(scene.film.aovs):
             if aov in scene.film.aovs[:i]:
@@ -252,17 +255,12 @@ def _check_mesh(mesh, path):
 
 
 def _check_numbers(record, path):
+    """But for those of a mesh, of which `meshes.tessellate` leaves out what cannot be rendered."""
     for field in record.__struct_fields__:
         value = getattr(record, field)
         place = f"{path}.{field}" if path else field
         if isinstance(value, (float, int)) or (isinstance(value, (tuple, list)) and field not in NUMBER_FIELDS):
             _check_value(value, place)
-        elif field in NUMBER_FIELDS and field != "faces" and value is not None and len(value):
-            table = np.asarray(value, dtype=np.float64)
-            wrong = ~(np.abs(table) <= _LARGEST)
-            if wrong.any():
-                row, column = np.argwhere(wrong)[0]
-                _check_value(float(table[row, column]), f"{place}[{row}]")
 
 
 def _check_value(value, place):
