@@ -62,7 +62,7 @@ def _write_meshes(scene, folder, final):
             plain = description.Mesh(
                 file=shape.file, part=shape.part, face_normals=shape.face_normals, flip_v=shape.flip_v
             )
-            mesh = meshes.tessellate(plain, f"shapes[{i}]")
+            mesh = meshes.own_space(plain, f"shapes[{i}]")
             meshes.write_ply(folder / name, mesh)
             written[key] = final / name, mesh.normals is not None
         path, has_normals = written[key]

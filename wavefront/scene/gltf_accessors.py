@@ -90,8 +90,8 @@ def _elements(document, view_index, offset, count, kind, width, place):
 
 
 def normalised(values: np.ndarray) -> np.ndarray:
-    """Integers as the numbers in [0, 1] or [-1, 1] that they stand for (section 3.6.2.2), float64."""
-    return np.maximum(values / float(np.iinfo(values.dtype).max), -1.0)
+    """Integers as the numbers in [0, 1] or [-1, 1] that they stand for (section 3.6.2.2), rounded to 32 bits."""
+    return np.maximum(values / float(np.iinfo(values.dtype).max), -1.0).astype(np.float32)
 
 
 def read_primitive(document: Document, mesh: int, primitive: int, uv_set: int = 0) -> Triangles:
@@ -163,7 +163,7 @@ def _floats(document, index, where, allowed, count=None) -> np.ndarray:
     if count is not None and len(values) != count:
         raise document.error(where, f"accessors[{index}] has {len(values)} elements for {count} positions")
     if document.root.accessors[index].normalized and values.dtype.kind in "iu":
-        return normalised(values)
+        values = normalised(values)
     return values.astype(np.float64)
 
 

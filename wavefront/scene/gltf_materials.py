@@ -265,7 +265,9 @@ class _Converter:
             fields["uv_transform"] = uv_transform(transform)
             uv_set = uv_set if transform.tex_coord is None else transform.tex_coord
         self.uv_sets.setdefault(uv_set, place.rsplit(".", 1)[-1])
-        return description.Bitmap(scale=scale, **fields)
+        if scale != 1.0:
+            fields["scale"] = scale
+        return description.Bitmap(**fields)
 
     def _sampler(self, sampler) -> dict:
         if sampler.wrap_s != sampler.wrap_t:
