@@ -159,6 +159,16 @@ def test_the_second_set_of_coordinates(builder, tmp_path):
     np.testing.assert_allclose(read_primitive(file, 0, 0, 1).uvs, [(0, 1), (0.2, 0), (1, 0.4)], rtol=1e-7)
 
 
+def test_primitives_that_share_vertices_keep_their_own(builder, tmp_path):
+    vertices = np.random.default_rng(4).normal(size=(9, 3)).astype(np.float32)
+    mesh = builder.mesh(vertices, [(7, 2, 5), (2, 8, 7)], normals=-vertices, uvs=vertices[:, :2])
+    found = read_primitive(document(builder, tmp_path), mesh, 0)
+    used = [2, 5, 7, 8]
+    np.testing.assert_array_equal(found.faces, [(2, 0, 1), (0, 3, 2)])
+    for array, expected in ((found.vertices, vertices), (found.normals, -vertices), (found.uvs, vertices[:, :2])):
+        np.testing.assert_array_equal(array, expected[used])
+
+
 # --- nodes -----------------------------------------------------------------------------------------------------
 
 

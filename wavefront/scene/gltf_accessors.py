@@ -95,7 +95,7 @@ def normalised(values: np.ndarray) -> np.ndarray:
 
 
 def read_primitive(document: Document, mesh: int, primitive: int, uv_set: int = 0) -> Triangles:
-    """The triangles of one primitive, in the space of its mesh.
+    """The triangles of one primitive, in the space of its mesh, with the vertices that they use.
 
     Args:
         document: The file.
@@ -128,7 +128,12 @@ def read_primitive(document: Document, mesh: int, primitive: int, uv_set: int = 
         if corners.max() >= count:
             message = f"index out of range: {corners.max()}, and there are {count} vertices"
             raise document.error(f"{where}.indices", message)
-    return Triangles(vertices, _faces(document, corners, record.mode, where), normals, uvs)
+    faces = _faces(document, corners, record.mode, where)
+    used, inverse = np.unique(faces, return_inverse=True)
+    if len(used) < count:  # primitives may share one long list of vertices
+        vertices, normals, uvs = (array if array is None else array[used] for array in (vertices, normals, uvs))
+        faces = inverse.reshape(-1, 3)
+    return Triangles(vertices, faces, normals, uvs)
 
 
 def _primitive(document, mesh, primitive) -> Primitive:
