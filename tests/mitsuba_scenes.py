@@ -88,6 +88,8 @@ EVERYTHING = "\n  ".join(
         _speck('<bsdf type="roughdielectric"/>', 0.5),
         _speck('<bsdf type="thindielectric"/>', 1.0),
         _speck('<bsdf type="null"/>', 1.1),
+        _speck('<bsdf type="principled"><float name="anisotropic" value="0.5"/></bsdf>', 1.2),
+        _speck('<bsdf type="principled"><float name="spec_trans" value="0.5"/></bsdf>', 1.3),
         _speck('<bsdf type="plastic"/>', 0.8),
         _speck('<bsdf type="roughplastic"/>', 0.9),
         _speck("", 0.6, '<emitter type="area"><rgb name="radiance" value="1"/></emitter>'),
@@ -138,10 +140,23 @@ _CHECKS = """<texture name="reflectance" type="checkerboard">
     </texture>"""
 
 
+_METALLIC = """<texture name="metallic" type="checkerboard">
+      <rgb name="color0" value="0.9"/><rgb name="color1" value="0.1"/>
+      <transform name="to_uv"><scale x="3" y="2"/></transform>
+    </texture>"""
+
+
 def _rough(kind: str, distribution: str, alpha: float, rest: str) -> str:
     return f"""<bsdf type="{kind}">
       <string name="distribution" value="{distribution}"/><float name="alpha" value="{alpha}"/>{rest}
     </bsdf>"""
+
+
+def _principled(**fields) -> str:
+    """The BSDF with numbers, and further elements as `rest`."""
+    rest = fields.pop("rest", '<rgb name="base_color" value="0.8, 0.4, 0.1"/>')
+    numbers = "".join(f'<float name="{name}" value="{value}"/>' for name, value in fields.items())
+    return f'<bsdf type="principled">{numbers}{rest}</bsdf>'
 
 
 _TWO_SIDES = f'<bsdf type="twosided">{_PAINT.format("0.8, 0.2, 0.1")}{_PAINT.format("0.1, 0.3, 0.8")}</bsdf>'
@@ -201,6 +216,43 @@ MIXED: dict[str, list[str]] = {
         LAMP,
         SKY,
         panel(_rough("roughplastic", "ggx", 0.2, _GLASS + _NONLINEAR + _texture("diffuse_reflectance"))),
+    ],
+    "principled": [FLOOR, LAMP, SKY, ball(_principled(roughness=0.5))],
+    "principled, opaque lobes": [
+        FLOOR,
+        LAMP,
+        SKY,
+        ball(
+            _principled(
+                roughness=0.6,
+                metallic=0.3,
+                spec_tint=0.6,
+                sheen=0.8,
+                sheen_tint=0.5,
+                flatness=0.6,
+                clearcoat=0.9,
+                clearcoat_gloss=0.2,
+                specular=0.8,
+            )
+        ),
+    ],
+    "principled, brushed metal": [
+        FLOOR,
+        WEAK_LAMP,
+        SKY,
+        ball(_principled(roughness=0.6, metallic=1.0, anisotropic=0.8)),
+    ],
+    "principled, glass": [FLOOR, SKY, ball(_principled(roughness=0.5, spec_trans=1.0, eta=1.4))],
+    "principled, half glass": [
+        FLOOR,
+        SKY,
+        ball(_principled(roughness=0.6, spec_trans=0.5, metallic=0.2, sheen=0.5, clearcoat=0.5)),
+    ],
+    "principled, textures": [
+        FLOOR,
+        LAMP,
+        SKY,
+        panel(f'<bsdf type="twosided">{_principled(rest=_texture("base_color") + _METALLIC)}</bsdf>'),
     ],
     "opacity": [
         FLOOR,

@@ -156,7 +156,10 @@ def test_older_dialect(folder):
     check_small(folder, "dialect 0.6", scenes.in_dialect_0_6(text))
 
 
-@pytest.mark.parametrize("name", ["cube and disk", "rough dielectric, Beckmann", "opacity bitmap", "bitmap, mirror"])
+@pytest.mark.parametrize(
+    "name",
+    ["cube and disk", "rough dielectric, Beckmann", "principled, half glass", "opacity bitmap", "bitmap, mirror"],
+)
 def test_records_of_a_file(folder, name):
     """Mitsuba's image of our records of a file is that of the file itself."""
     path = folder / "scene.xml"

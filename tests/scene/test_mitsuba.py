@@ -250,6 +250,38 @@ BSDFS = [
         d.TwoSided(front=d.Diffuse(), back=d.Conductor(eta=0.0, k=1.0)),
     ),
     ('<bsdf type="mask"><bsdf type="diffuse"/></bsdf>', d.Mask(bsdf=d.Diffuse(), opacity=0.5)),
+    ('<bsdf type="principled"/>', d.Principled()),
+    (
+        '<bsdf type="principled"><rgb name="base_color" value="0.1 0.2 0.3"/><float name="roughness" value="0.05"/>'
+        '<float name="anisotropic" value="0.1"/><float name="metallic" value="0.15"/>'
+        '<float name="spec_trans" value="0.2"/><float name="eta" value="1.4"/><float name="spec_tint" value="0.25"/>'
+        '<float name="sheen" value="0.3"/><float name="sheen_tint" value="0.35"/><float name="flatness" value="0.4"/>'
+        '<float name="clearcoat" value="0.45"/><float name="clearcoat_gloss" value="0.55"/>'
+        '<float name="main_specular_sampling_rate" value="2"/><float name="clearcoat_sampling_rate" value="3"/>'
+        '<float name="diffuse_reflectance_sampling_rate" value="4"/></bsdf>',
+        d.Principled(
+            base_color=[0.1, 0.2, 0.3],
+            roughness=0.05,
+            anisotropic=0.1,
+            metallic=0.15,
+            spec_trans=0.2,
+            eta=1.4,
+            spec_tint=0.25,
+            sheen=0.3,
+            sheen_tint=0.35,
+            flatness=0.4,
+            clearcoat=0.45,
+            clearcoat_gloss=0.55,
+            main_specular_sampling_rate=2.0,
+            clearcoat_sampling_rate=3.0,
+            diffuse_reflectance_sampling_rate=4.0,
+        ),
+    ),
+    (
+        '<bsdf type="twosided"><bsdf type="principled"><float name="specular" value="0"/>'
+        '<texture name="sheen" type="checkerboard"/></bsdf></bsdf>',
+        d.TwoSided(front=d.Principled(specular=0.0, sheen=d.Checkerboard(color0=0.2, color1=0.4))),
+    ),
     ('<bsdf type="null"/>', d.Null()),
     ('<bsdf type="thindielectric"><float name="int_ior" value="1.5"/></bsdf>', d.ThinDielectric(int_ior=1.5)),
 ]

@@ -65,6 +65,15 @@ def moved(*transform, shape=d.Rectangle):
             f"bsdfs[0].front: a twosided BSDF cannot hold dielectric; allowed: {REFLECTING}",
         ),
         (
+            with_bsdfs(d.TwoSided(front=d.Diffuse(), back=d.Principled(spec_trans=0.1))),
+            "bsdfs[0].back: a principled BSDF that transmits is on both sides already; spec_trans must be 0",
+        ),
+        (
+            with_bsdfs(d.Principled(eta=1.5, specular=0.5)),
+            "bsdfs[0]: a principled BSDF has eta or specular; found both",
+        ),
+        (with_bsdfs(d.Principled(sheen_tint="x")), "bsdfs[0].sheen_tint: unknown texture 'x'; none is defined"),
+        (
             with_bsdfs(d.TwoSided(front=d.ThinDielectric())),
             f"bsdfs[0].front: a twosided BSDF cannot hold thin_dielectric; allowed: {REFLECTING}",
         ),
@@ -276,6 +285,8 @@ def test_a_rotation_without_an_axis_is_refused():
     "scene",
     [
         with_bsdfs(d.Mask(name="m", bsdf="t"), d.TwoSided(name="t", front="d", back=d.Conductor(material="none"))),
+        with_bsdfs(d.TwoSided(front=d.Principled(anisotropic=0.5, clearcoat=d.Checkerboard()), back=d.Principled())),
+        with_bsdfs(d.Mask(bsdf=d.Principled(spec_trans=d.Checkerboard(), eta=1.0))),
         with_bsdfs(d.TwoSided(front=d.OrenNayar(roughness=d.Checkerboard(color0=0.0, color1=1.0)))),
         with_bsdfs(
             d.TwoSided(front=d.Plastic(int_ior="water"), back=d.RoughPlastic(diffuse_reflectance=[1.0, 0.0, 0.5]))
