@@ -193,7 +193,7 @@ CASES = list(itertools.product(["normal", "bump"], [*INNER, "inside"], [True, Fa
 
 @pytest.mark.parametrize(("kind", "inner", "flip", "shadowing"), CASES)
 def test_against_mitsuba(kind, inner, flip, shadowing, height_file):
-    """In a random frame; `inside` has the map inside of the two-sided BSDF."""
+    """In a random frame where Mitsuba can; `inside` has the map inside of the two-sided BSDF."""
     settings = {"flip_invalid_normals": flip, "shadowing": shadowing}
     theirs = {"flip_invalid_normals": flip, "use_shadowing_function": shadowing}
     if kind == "normal":
@@ -219,6 +219,8 @@ def test_against_mitsuba(kind, inner, flip, shadowing, height_file):
     u = harness.uniforms(PAIRS, 13)
     rng = np.random.default_rng(5)
     s, t, n, jacobian = turned(17)
+    if kind == "bump":  # Mitsuba 3.9 makes its tangent of dp/du in world space and the normal in the frame's own
+        s, t, n = np.eye(3)
     uv = rng.random((PAIRS, 2)).astype(np.float32)
     _, e, sample = m.run(0, wo, wi, u, vertices(PAIRS, uv, s, t, jacobian))
     frame = np.array([s, t, n])
