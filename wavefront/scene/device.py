@@ -38,6 +38,7 @@ class DeviceScene:
     bsdfs: tuple[str, ...]
     mask: bool
     tangents: bool
+    maps: tuple[str, ...]
     texture_kinds: tuple[str, ...]
     light_kinds: tuple[str, ...]
     light_texture_kinds: tuple[str, ...]
@@ -84,6 +85,7 @@ class _Upload:
             bsdfs=tuple(sorted(self.materials.kinds)),
             mask=self.materials.mask,
             tangents=self.materials.tangents,
+            maps=tuple(sorted(self.materials.map_kinds)),
             texture_kinds=tuple(sorted(set(self.atlas.kinds))),
             light_kinds=light_kinds,
             light_texture_kinds=tuple(sorted(self.light_texture_kinds)),
@@ -121,6 +123,7 @@ class _Upload:
                 if textured and mesh.uvs is None:
                     self.notes.append(f"{named} has no UVs: its textures are looked up at (0, 0)")
                 record["smooth"] = int(mesh.normals is not None)
+                record["polar"] = int(isinstance(shape, description.Disk))
                 meshes.append((record, mesh, emitter))
         clear_cache()
         return meshes, spheres

@@ -96,6 +96,10 @@ class _Converter:
         transmits = isinstance(bsdf, description.ThinDielectric) or bsdf.spec_trans != 0.0
         if material.double_sided and not transmits:
             bsdf = description.TwoSided(front=bsdf)
+        if material.normal_texture is not None:
+            info = material.normal_texture
+            normal = self._bitmap(info, f"{self.where}.normalTexture", 1.0, color_space="linear")
+            bsdf = description.NormalMap(bsdf=bsdf, normal=normal, scale=info.scale)
         opacity = self._opacity()
         if opacity != 1.0:
             cutoff = material.alpha_cutoff if material.alpha_mode == "MASK" else None
