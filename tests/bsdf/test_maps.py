@@ -94,6 +94,26 @@ def test_a_tilted_normal_map_is_a_tilted_surface(inner):
         np.testing.assert_allclose(sample[field][kept], expected_sample[field][kept], rtol=1e-3, atol=1e-5)
 
 
+@pytest.mark.parametrize("scale", [0.0, 0.5, -2.0])
+def test_the_scale_of_a_normal_map_multiplies_x_and_y(scale):
+    normal = unit([0.3, -0.2, 0.9])
+    expected = unit(normal * (scale, scale, 1.0))
+    m = Materials(d.NormalMap(bsdf=DIFFUSE, normal=coded(normal), scale=scale))
+    frames, _, _ = m.run(0, [expected], None, np.zeros((1, 3)))
+    np.testing.assert_allclose(frames["normal"][0], expected, atol=1e-6)
+
+
+def test_the_scale_of_a_height_image_counts(height_file):
+    """As that of the bump map does."""
+    bumps = [
+        d.BumpMap(bsdf=DIFFUSE, height=d.Bitmap(file=height_file, scale=a), scale=b) for a, b in ((0.25, 1), (1, 0.25))
+    ]
+    m = Materials(*bumps, d.BumpMap(bsdf=DIFFUSE, height=d.Bitmap(file=height_file)))
+    normals = [m.run(i, [[0, 0, 1]], None, np.zeros((1, 3)))[0]["normal"] for i in range(3)]
+    np.testing.assert_allclose(normals[0], normals[1], atol=1e-6)
+    assert np.abs(normals[0] - normals[2]).max() > 0.01
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_a_ramp_is_an_inclined_plane(seed, tmp_path):
     """The height h = p u + q v along n turns the plane dp/du, dp/dv into that of dp/du + p n, dp/dv + q n."""
