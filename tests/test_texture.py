@@ -195,6 +195,10 @@ def test_scale_multiplies_the_linear_values(name, nearest):
     tables, texture = upload(name, srgb=True, nearest=nearest)
     scaled, _ = upload(name, srgb=True, nearest=nearest, scale=4.0)
     np.testing.assert_array_equal(look_up(scaled, texture, uv), 4.0 * look_up(tables, texture, uv))
+    coloured, _ = upload(name, srgb=True, nearest=nearest, scale=(4.0, 0.5, 0.0))
+    np.testing.assert_array_equal(
+        look_up(coloured, texture, uv), np.float32((4.0, 0.5, 0.0)) * look_up(tables, texture, uv)
+    )
 
 
 def test_mirrored_nearest_at_the_edges():

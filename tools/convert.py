@@ -1,8 +1,8 @@
 """Converts a scene to our JSON format: ``python -m tools.convert scene.xml out.json``.
 
-Meshes are written as binary PLY to ``<out>_meshes/`` and textures are copied to ``<out>_textures/``, both beside the
-JSON file, which refers to them by relative path. Everything is written under temporary names first, and the JSON file
-is put in place last, so that an error leaves nothing half-written.
+Meshes are written as binary PLY to ``<out>_meshes/`` and textures are copied (out of a glTF file, too) to
+``<out>_textures/``, both beside the JSON file, which refers to them by relative path. Everything is written under
+temporary names first, and the JSON file is put in place last, so that an error leaves nothing half-written.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from pathlib import Path
 
 from wavefront.errors import SceneError, WavefrontError
 from wavefront.scene import description, json_format, load_scene, meshes
+from wavefront.scene.gltf_images import embedded_image
 from wavefront.scene.images import replacing
 from wavefront.scene.lookup import walk
 
@@ -59,38 +60,47 @@ def _write_meshes(scene, folder, final, warn):
     for i, shape in enumerate(scene.shapes):
         if not isinstance(shape, description.Mesh) or shape.file is None:
             continue
-        key = (shape.file, shape.face_normals, shape.flip_v)
+        key = (shape.file, repr(shape.part), shape.face_normals, shape.flip_v)
         if key not in written:
             folder.mkdir(exist_ok=True)
             name = _free_name(Path(shape.file).stem, ".ply", taken)
-            plain = description.Mesh(file=shape.file, face_normals=shape.face_normals, flip_v=shape.flip_v)
-            mesh = meshes.tessellate(plain, f"shapes[{i}]")
+            plain = description.Mesh(
+                file=shape.file, part=shape.part, face_normals=shape.face_normals, flip_v=shape.flip_v
+            )
+            mesh = meshes.own_space(plain, f"shapes[{i}]")
             for note in mesh.notes:
                 warn(f"{shape.file}: {note}")
             meshes.write_ply(folder / name, mesh)
             written[key] = final / name, mesh.normals is not None
         path, has_normals = written[key]
-        shape.file, shape.flip_v = str(path), None
+        shape.file, shape.part, shape.flip_v = str(path), None, None
         # computed normals stay with the reader: they depend on to_world, under which angles change
         shape.smooth_normals = shape.smooth_normals and not has_normals
 
 
 def _copy_textures(scene, folder, final):
-    copied: dict[str, Path] = {}
+    copied: dict[tuple, Path] = {}
     taken: set[str] = set()
     for path, record in walk(scene):
         if not isinstance(record, (description.Bitmap, description.Envmap)):
             continue
-        if record.file not in copied:
+        source, image = Path(record.file), getattr(record, "image", None)
+        if (source, image) not in copied:
             folder.mkdir(exist_ok=True)
-            source = Path(record.file)
-            name = _free_name(source.stem, source.suffix, taken)
-            try:
-                shutil.copyfile(source, folder / name)
-            except FileNotFoundError:
-                raise SceneError(f"{source}: file not found", path=f"{path}.file") from None
-            copied[record.file] = final / name
-        record.file = str(copied[record.file])
+            if image is not None:
+                data, suffix = embedded_image(record.file, image, f"{path}.file")
+                name = _free_name(f"{source.stem}_{image}", suffix, taken)
+                (folder / name).write_bytes(data)
+            else:
+                name = _free_name(source.stem, source.suffix, taken)
+                try:
+                    shutil.copyfile(source, folder / name)
+                except FileNotFoundError:
+                    raise SceneError(f"{source}: file not found", path=f"{path}.file") from None
+            copied[source, image] = final / name
+        record.file = str(copied[source, image])
+        if image is not None:
+            record.image = None
 
 
 def _free_name(stem, suffix, taken):
@@ -117,10 +127,10 @@ def _replace_folder(new, final, mark):
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command. Returns its exit code: 0, or 2 after an error, of which one line is printed."""
     parser = argparse.ArgumentParser(prog="python -m tools.convert", description=__doc__.split("\n\n")[0])
-    parser.add_argument("scene", help="the scene to convert: Mitsuba XML, or our JSON")
+    parser.add_argument("scene", help="the scene to convert: Mitsuba XML, glTF, or our JSON")
     parser.add_argument("out", help="the JSON file to write")
     parser.add_argument("-D", dest="parameters", action="append", default=[], metavar="NAME=VALUE",
-                        help="a value for $NAME in a Mitsuba scene; may be repeated")  # fmt: skip
+                        help="a value for $NAME of a Mitsuba scene; camera or scene of a glTF file")  # fmt: skip
     parser.add_argument("--bake-emitters", action="store_true",
                         help="let Mitsuba bake a sunsky to an environment map and a sun")  # fmt: skip
     parser.add_argument("--quiet", action="store_true", help="print no warnings")

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from tools import camera_scenes, door_scene, glass_scenes, light_scenes
+from tools import camera_scenes, door_scene, glass_scenes, gltf_scene, light_scenes
 from tools.scene_parts import box, film, look_at, place, rectangle, revolve, write_ply
 from wavefront.scene import json_format
 from wavefront.scene.description import (
@@ -66,6 +66,8 @@ def write(folder: Path) -> list[str]:
     Image.fromarray(tiles()).save(folder / names[2], optimize=True)
     names.append("textures/sky.exr")
     light_scenes.write_sky(folder / names[3])
+    names.append("still-life.glb")
+    gltf_scene.still_life().write(folder / names[4])
     scenes = {
         "cornell-box.json": cornell_box(),
         "furnace.json": furnace(),

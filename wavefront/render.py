@@ -40,7 +40,7 @@ EXIT_SIGNAL = 128  # plus the number of the signal
 CHECKPOINT_SECONDS = 300.0
 
 DESCRIPTION = """\
-Render a scene: our own scene.json (see --schema) or Mitsuba's scene.xml.
+Render a scene: our own scene.json (see --schema), Mitsuba's scene.xml, or glTF.
 
 Writes OUT.exr (linear radiance, and the AOVs asked for), OUT.png (the same, for the eye) and OUT.json (settings,
 versions, times and counts)."""
@@ -97,7 +97,7 @@ def build_parser() -> argparse.ArgumentParser:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("scene", nargs="?", metavar="SCENE", help="scene.json or scene.xml")
+    parser.add_argument("scene", nargs="?", metavar="SCENE", help="scene.json, scene.xml, or scene.gltf or .glb")
     parser.add_argument("--schema", action="store_true", help="print the JSON Schema of the scene format and exit")
     parser.add_argument("--version", action="version", version=f"wavefront {wavefront.__version__}")
 
@@ -126,7 +126,11 @@ def build_parser() -> argparse.ArgumentParser:
         "--set", action="append", default=[], metavar="PATH=VALUE", help="change any key, as in integrator.max_depth=6"
     )
     sampling.add_argument(
-        "--define", action="append", default=[], metavar="NAME=VALUE", help="value of a $NAME of a Mitsuba scene"
+        "--define",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="value of a $NAME of a Mitsuba scene; camera=NAME or scene=NAME of a glTF file",
     )
 
     long = parser.add_argument_group("long renders")

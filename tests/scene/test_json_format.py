@@ -491,11 +491,12 @@ def test_load_scene_goes_by_the_suffix(write, tmp_path):
     assert load_scene(write({"shapes": [SPHERE]}), ["shapes[0].radius=3"], warn=warnings.append).shapes[0].radius == 3.0
     assert warnings == ["the scene has no emitter: the image will be black"]
     cases = {
-        tmp_path / "s.blend": "unknown scene format '.blend'; allowed: .json, .xml",
-        tmp_path / "no-suffix": "unknown scene format ''; allowed: .json, .xml",
+        tmp_path / "s.blend": "unknown scene format '.blend'; allowed: .json, .xml, .gltf, .glb",
+        tmp_path / "no-suffix": "unknown scene format ''; allowed: .json, .xml, .gltf, .glb",
         tmp_path / "none.json": "file not found",
         tmp_path / "none.xml": "file not found",
-        tmp_path: "is a directory; expected a .json or .xml file",
+        tmp_path / "none.glb": "file not found",
+        tmp_path: "is a directory; expected a file, .json, .xml, .gltf, .glb",
     }
     for path, message in cases.items():
         with pytest.raises(SceneError) as caught:
@@ -503,4 +504,4 @@ def test_load_scene_goes_by_the_suffix(write, tmp_path):
         assert str(caught.value) == f"{path}: {message}"
     with pytest.raises(SceneError) as caught:
         load_scene(write({}), parameters={"spp": "3"})
-    assert caught.value.message == "parameters are for Mitsuba scenes only; found spp"
+    assert caught.value.message == "parameters are for Mitsuba and glTF scenes; found spp"

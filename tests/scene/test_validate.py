@@ -16,7 +16,10 @@ from wavefront.scene.validate import MESH_SUFFIXES, validate
 STEP = d.TransformStep
 TILES = str(Path(__file__).parents[2] / "scenes" / "textures" / "tiles.png")
 STEPS = "translate, rotate, scale, look_at, matrix"
-REFLECTING = "diffuse, oren_nayar, conductor, rough_conductor, plastic, rough_plastic, principled"
+REFLECTING = (
+    "diffuse, oren_nayar, conductor, rough_conductor, plastic, rough_plastic, principled, a blend of those, and a "
+    "normal_map or bump_map around one"
+)
 TOO_LARGE = "expected a number of at most 3.403e+38, as 32-bit floats are; found"
 
 

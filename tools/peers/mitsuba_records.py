@@ -187,6 +187,25 @@ class _Writer:
         if isinstance(bsdf, description.TwoSided):
             front = self._bsdf(bsdf.front)
             return {"type": "twosided", "front": front, "back": front if bsdf.back is None else self._bsdf(bsdf.back)}
+        if isinstance(bsdf, description.Blend):
+            weight = self._parameter(bsdf.weight, scalar=True)
+            return {
+                "type": "blendbsdf",
+                "weight": weight,
+                "bsdf_0": self._bsdf(bsdf.first),
+                "bsdf_1": self._bsdf(bsdf.second),
+            }
+        if isinstance(bsdf, (description.NormalMap, description.BumpMap)):
+            result = {"flip_invalid_normals": bsdf.flip_invalid_normals, "use_shadowing_function": bsdf.shadowing}
+            result["nested"] = self._bsdf(bsdf.bsdf)
+            if isinstance(bsdf, description.NormalMap) and bsdf.scale != 1.0:
+                raise WavefrontError("Mitsuba's normalmap has no scale")
+            if isinstance(bsdf, description.NormalMap):
+                return result | {"type": "normalmap", "normalmap": self._parameter(bsdf.normal, scalar=True)}
+            height = self._parameter(bsdf.height, scalar=True)
+            return result | {"type": "bumpmap", "height": height, "scale": bsdf.scale}
+        if isinstance(bsdf, description.Mask) and bsdf.cutoff is not None:
+            raise WavefrontError("Mitsuba's mask has no cutoff")
         if isinstance(bsdf, description.Mask):
             opacity = self._parameter(bsdf.opacity, scalar=True)
             return {"type": "mask", "opacity": opacity, "nested": self._bsdf(bsdf.bsdf)}
@@ -256,6 +275,8 @@ class _Writer:
     def _bitmap(self, bitmap, scalar):
         if bitmap.scale != 1.0:
             raise WavefrontError(f"{bitmap.file}: Mitsuba has no scale of a bitmap")
+        if bitmap.channel is not None or bitmap.image is not None:
+            raise WavefrontError(f"{bitmap.file}: Mitsuba takes no channel of a bitmap, and no image inside a file")
         is_float = bitmap.file.lower().endswith(".exr")
         if is_float and bitmap.color_space == "srgb":
             raise WavefrontError(f"{bitmap.file}: Mitsuba takes no OpenEXR image as sRGB")

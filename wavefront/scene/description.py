@@ -74,11 +74,20 @@ class Bitmap(Record, tag_field="type", tag="bitmap"):
 
     file: Annotated[str, Meta(description="Path of the image, relative to the scene file.", min_length=1)]
     name: str = ""
+    image: Annotated[
+        Annotated[int, Meta(ge=0)] | None, Meta(description="Index of an image that lies inside a glTF file.")
+    ] = None
+    channel: Annotated[
+        Literal["r", "g", "b", "a"] | None,
+        Meta(description="This one alone, as a number; default: the colour. a is 1 where the image has no alpha."),
+    ] = None
     color_space: Annotated[
         Literal["auto", "srgb", "linear"],
         Meta(description="How values are encoded; auto: colours of 8 or 16 bit are sRGB, all else is linear."),
     ] = "auto"
-    scale: Annotated[NonNegative, Meta(description="Multiplies the (linear) values.")] = 1.0
+    scale: Annotated[
+        NonNegative | RGB, Meta(description="Multiplies the (linear) values; a colour those of the same channel.")
+    ] = 1.0
     filter: Literal["bilinear", "nearest"] = "bilinear"
     wrap: Literal["repeat", "mirror", "clamp"] = "repeat"
     uv_transform: UVTransform = IDENTITY_UV
@@ -285,6 +294,51 @@ class Mask(Record, tag_field="type", tag="mask"):
     bsdf: Annotated[str | Bsdf, Meta(description="Name of a BSDF, or a BSDF.")]
     name: str = ""
     opacity: Opacity = 0.5
+    cutoff: Annotated[
+        Positive | None,
+        Meta(description="Where opacity is at least this, the surface is there for certain, and elsewhere it is not."),
+    ] = None
+
+
+class NormalMap(Record, tag_field="type", tag="normal_map"):
+    """Turns the shading frame by normals from an image; goes around what is to be shaded so."""
+
+    bsdf: Annotated[str | Bsdf, Meta(description="Name of a BSDF, or a BSDF; no mask, null or other map.")]
+    normal: Annotated[
+        RGBFraction | str | Bitmap | Checkerboard,
+        Meta(description="(x, y, z) of the normal scaled to [0, 1]; x is along growing u. 8-bit images are linear."),
+    ]
+    name: str = ""
+    scale: Annotated[float, Meta(description="Multiplies x and y of the normal.")] = 1.0
+    flip_invalid_normals: Annotated[
+        bool, Meta(description="Turn a normal that faces away from the viewer about the base normal.")
+    ] = True
+    shadowing: Annotated[bool, Meta(description="Darken light from near the horizon of the base surface.")] = True
+
+
+class BumpMap(Record, tag_field="type", tag="bump_map"):
+    """Turns the shading frame by the slope of a height field; goes around what is to be shaded so."""
+
+    bsdf: Annotated[str | Bsdf, Meta(description="Name of a BSDF, or a BSDF; no mask, null or other map.")]
+    height: Annotated[
+        str | Bitmap,
+        Meta(description="Bilinear image of the height along the normal, metres. 8-bit images are linear."),
+    ]
+    name: str = ""
+    scale: Annotated[float, Meta(description="Multiplies the height.")] = 1.0
+    flip_invalid_normals: Annotated[
+        bool, Meta(description="Turn a normal that faces away from the viewer about the base normal.")
+    ] = True
+    shadowing: Annotated[bool, Meta(description="Darken light from near the horizon of the base surface.")] = True
+
+
+class Blend(Record, tag_field="type", tag="blend"):
+    """A mixture of two BSDFs, (1 - weight) first + weight second, each of which may be a blend."""
+
+    first: Annotated[str | Bsdf, Meta(description="Name of a BSDF, or a BSDF; no mask, twosided or map.")]
+    second: Annotated[str | Bsdf, Meta(description="Name of a BSDF, or a BSDF; no mask, twosided or map.")]
+    name: str = ""
+    weight: Annotated[Opacity, Meta(description="Of the second.")] = 0.5
 
 
 Bsdf = (
@@ -299,6 +353,9 @@ Bsdf = (
     | RoughPlastic
     | Principled
     | Null
+    | Blend
+    | NormalMap
+    | BumpMap
     | TwoSided
     | Mask
 )
@@ -439,11 +496,22 @@ class Shape(Record):
     exterior: Annotated[str | Medium | None, Meta(description="The medium in front of the surface.")] = None
 
 
+class GltfPart(Record):
+    """One primitive of a glTF file, in the space of its mesh."""
+
+    mesh: Annotated[int, Meta(ge=0, description="Index of the mesh in the file.")]
+    primitive: Annotated[int, Meta(ge=0, description="Index of the primitive in the mesh.")] = 0
+    uv_set: Annotated[int, Meta(ge=0, le=1, description="The n of the attribute TEXCOORD_n.")] = 0
+
+
 class Mesh(Shape, tag_field="type", tag="mesh"):
     """Triangles from a PLY, OBJ or glTF file, or inline. UVs and normals are per vertex."""
 
     file: Annotated[
         str | None, Meta(description="PLY, OBJ, glTF or GLB, relative to the scene file; excludes vertices and faces.")
+    ] = None
+    part: Annotated[
+        GltfPart | None, Meta(description="Of a glTF or GLB file; default: the meshes of all its nodes, as one.")
     ] = None
     vertices: list[Vec3] | None = None
     faces: list[tuple[int, int, int]] | None = None

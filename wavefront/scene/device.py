@@ -40,6 +40,7 @@ class DeviceScene:
     mask: bool
     tangents: bool
     media: bool
+    maps: tuple[str, ...]
     texture_kinds: tuple[str, ...]
     light_kinds: tuple[str, ...]
     light_texture_kinds: tuple[str, ...]
@@ -89,6 +90,7 @@ class _Upload:
             mask=self.materials.mask,
             tangents=self.materials.tangents,
             media=self.media.absorbing,
+            maps=tuple(sorted(self.materials.map_kinds)),
             texture_kinds=tuple(sorted(set(self.atlas.kinds))),
             light_kinds=light_kinds,
             light_texture_kinds=tuple(sorted(self.light_texture_kinds)),
@@ -128,6 +130,7 @@ class _Upload:
                 if textured and mesh.uvs is None:
                     self.notes.append(f"{named} has no UVs: its textures are looked up at (0, 0)")
                 record["smooth"] = int(mesh.normals is not None)
+                record["polar"] = int(isinstance(shape, description.Disk))
                 meshes.append((record, mesh, emitter))
         clear_cache()
         return meshes, spheres

@@ -5,6 +5,7 @@ msgspec tells where a value does not fit the records; the type found there tells
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import functools
 import re
@@ -19,8 +20,8 @@ Step = str | int
 _STEP = re.compile(r"\.([A-Za-z_]\w*)|\[(\d+)\]")
 
 
-def explain(raw: object, error: Exception) -> tuple[list[Step], str, str | None]:
-    """Where and why `raw` is not a scene, from the exception that ``msgspec.convert`` raised.
+def explain(raw: object, error: Exception, root: type = description.Scene) -> tuple[list[Step], str, str | None]:
+    """Where and why `raw` is not a scene (or another `root`), from the exception that ``msgspec.convert`` raised.
 
     Returns:
         The steps to the value, the message, and the unknown key if that is the trouble.
@@ -30,7 +31,7 @@ def explain(raw: object, error: Exception) -> tuple[list[Step], str, str | None]
     if steps and steps[-1] == "type":  # the record that cannot be told apart, not its tag
         tag = steps.pop()
     try:
-        value, types = _descend(raw, steps)
+        value, types = _descend(raw, steps, root)
     except (LookupError, TypeError):
         return [], _first_line(error), None
     if isinstance(value, dict) and any(isinstance(t, inspect.StructType) for t in types):
@@ -39,6 +40,8 @@ def explain(raw: object, error: Exception) -> tuple[list[Step], str, str | None]
             return [*steps, "type"] if at_type else steps, message, key
     if tag is not None:
         steps.append(tag)
+        with contextlib.suppress(LookupError, TypeError):  # of a record that has a type as its own field
+            value, types = _descend(raw, steps, root)
     if isinstance(value, int) and abs(value) > sys.float_info.max:
         return steps, f"the number {found(value)} is too large", None
     if not isinstance(value, (dict, list)) or not _allows(types, value):
@@ -90,8 +93,8 @@ def allowed(types: tuple[inspect.Type, ...]) -> str:
 
 
 @functools.cache
-def _root() -> inspect.Type:
-    return inspect.type_info(description.Scene)
+def _type_info(root: type) -> inspect.Type:
+    return inspect.type_info(root)
 
 
 def _error_steps(message: str) -> list[Step]:
@@ -108,9 +111,9 @@ def _variants(kind: inspect.Type) -> tuple[inspect.Type, ...]:
     return (kind,)
 
 
-def _descend(raw, steps):
+def _descend(raw, steps, root):
     """The value at `steps` and the types it may have."""
-    value, types = raw, _variants(_root())
+    value, types = raw, _variants(_type_info(root))
     for step in steps:
         parent, value = value, value[step]
         if isinstance(step, int):
@@ -147,7 +150,7 @@ def _explain_object(value, types):
     record = records[0]
     keys = (["type"] if record.tag is not None else []) + [field.encode_name for field in record.fields]
     for key in value:
-        if key not in keys:
+        if key not in keys and record.forbid_unknown_fields:
             return f"unknown key {shown(key)}{_nearest(key, keys)} valid keys: {', '.join(keys)}", key, False
     for field in record.fields:
         if field.required and field.encode_name not in value:

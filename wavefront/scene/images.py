@@ -47,7 +47,7 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
 # --- reading ---------------------------------------------------------------------------------------------------
 
 
-def load_image(path: str | os.PathLike, where: str = "") -> np.ndarray:
+def load_image(path: str | os.PathLike, where: str = "", alpha: bool = False) -> np.ndarray:
     """Pixels of an image file, first row on top, as encoded (no colour conversion).
 
     The type is that of the file: 8-bit images give uint8 and 16-bit ones uint16, for 0 to 1; OpenEXR images of halves
@@ -57,6 +57,7 @@ def load_image(path: str | os.PathLike, where: str = "") -> np.ndarray:
     Args:
         path: The file.
         where: Record path that an error names, such as ``textures[0].file``.
+        alpha: The alpha channel in place of the colours; where there is none, it is 1.
 
     Returns:
         (H, W, C) of one of these types, C is 1 or 3.
@@ -71,11 +72,11 @@ def load_image(path: str | os.PathLike, where: str = "") -> np.ndarray:
         raise SceneError(f"{path}: not a file", path=where)
     suffix = path.suffix.lower()
     if suffix == ".exr":
-        pixels = _load_exr(path, where)
+        pixels = _load_exr(path, where, alpha)
     elif suffix in (".hdr", ".tif", ".tiff") or (suffix == ".png" and _is_16_bit_png(path)):
-        pixels = _load_oiio(path, where)
+        pixels = _load_oiio(path, where, alpha)
     else:
-        pixels = _load_pillow(path, where)
+        pixels = _load_pillow(path, where, alpha)
     if not pixels.size:
         raise SceneError(f"{path}: the image has no pixels", path=where)
     if suffix == ".hdr":  # 8-bit mantissas, but exponents that may be out of range
@@ -93,9 +94,11 @@ def _is_16_bit_png(path):
     return head[12:16] == b"IHDR" and head[24:] == b"\x10"
 
 
-def _load_pillow(path, where):
+def _load_pillow(path, where, alpha):
     try:
         with Image.open(path) as image:
+            if alpha:
+                return np.asarray(image.convert("RGBA").getchannel("A"), np.uint8)[:, :, None]
             grey = image.mode in ("1", "L", "LA", "La")
             if image.mode == "P" and image.palette is not None and image.palette.mode in ("L", "LA"):
                 grey = True
@@ -106,14 +109,17 @@ def _load_pillow(path, where):
     return pixels[:, :, None] if pixels.ndim == 2 else pixels
 
 
-def _load_exr(path, where):
+def _load_exr(path, where, alpha):
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
     except Exception as error:  # the binding raises RuntimeError, ValueError and others
         text = " ".join(str(error).split()) or "not an OpenEXR file"
         raise SceneError(f"{path}: cannot be read: {text}", path=where) from None
-    colours = [name for name in channels if name != "A"]
+    if alpha:
+        first = next(iter(channels.values()))
+        channels = {"A": channels.get("A", np.ones_like(first))}
+    colours = [name for name in channels if name != "A" or alpha]
     if all(name in channels for name in "RGB"):
         colours = ["R", "G", "B"]
     elif "Y" in channels:
@@ -124,7 +130,7 @@ def _load_exr(path, where):
     return pixels if pixels.dtype == np.float16 else pixels.astype(np.float32, copy=False)
 
 
-def _load_oiio(path, where):
+def _load_oiio(path, where, alpha):
     import OpenImageIO  # only here: hardly any scene needs it
 
     config = OpenImageIO.ImageSpec()
@@ -141,6 +147,10 @@ def _load_oiio(path, where):
     if pixels is None:
         text = " ".join((image or OpenImageIO).geterror().split()) or "not an image"
         raise SceneError(f"{path}: cannot be read: {text}", path=where)
+    if alpha:
+        opaque = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1
+        found = image.spec().alpha_channel
+        return pixels[:, :, found : found + 1] if found >= 0 else np.full_like(pixels[:, :, :1], opaque)
     return pixels[:, :, : 3 if pixels.shape[2] >= 3 else 1]
 
 

@@ -105,13 +105,21 @@ _DECODER = json.JSONDecoder(object_pairs_hook=_object, parse_constant=_refuse_co
 def _read(path):
     """The raw object in the file `path`."""
     try:
-        data = Path(path).read_bytes()
+        return parse_object(Path(path).read_bytes(), path)
     except FileNotFoundError:
         raise SceneError("file not found", path) from None
     except IsADirectoryError:
         raise SceneError("is a directory; expected a scene file", path) from None
     except (OSError, ValueError) as error:
         raise SceneError(f"cannot be read: {getattr(error, 'strerror', None) or error}", path) from None
+
+
+def parse_object(data: bytes, path: str | os.PathLike) -> dict:
+    """The object that the JSON text `data` of the file `path` says: UTF-8, no key twice, no NaN.
+
+    Raises:
+        SceneError: With the line and column of what is wrong.
+    """
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -133,9 +141,9 @@ def _parse(text, path):
         raise SceneError("nested too deeply", path) from None
     except ValueError:
         raise _bad_number(text, path) from None
-    for steps, item in _containers(raw):
+    for steps, item in containers(raw):
         if isinstance(item, _RepeatedKey):
-            raise SceneError(f"the key {shown(item.key)} is given twice", path, _printable_path(steps))
+            raise SceneError(f"the key {shown(item.key)} is given twice", path, printable_path(steps))
     return raw
 
 
@@ -149,7 +157,7 @@ def _bad_number(text, path):
     return SceneError("not JSON: a number cannot be read", path)
 
 
-def _containers(raw):
+def containers(raw):
     """All objects in `raw` with the steps to them; lists of numbers are not looked into."""
     stack = [([], raw)] if isinstance(raw, (dict, list)) else []
     while stack:
@@ -162,7 +170,8 @@ def _containers(raw):
         stack.extend(child for child in reversed(children) if isinstance(child[1], (dict, list)))
 
 
-def _printable_path(steps):
+def printable_path(steps):
+    """A path such as ``bsdfs[2].alpha`` from its steps, quoted where a key is not a word."""
     return format_path([step if isinstance(step, int) or step.isidentifier() else shown(step) for step in steps])
 
 
@@ -181,7 +190,7 @@ def _convert(raw, path, overrides=()):
         if steps[: len(target)] == target or (key is not None and [*steps, key][: len(target)] == target):
             message += f" (set by {shown(override)})"
             break
-    raise SceneError(message, path, _printable_path(steps))
+    raise SceneError(message, path, printable_path(steps))
 
 
 def _make_absolute(scene, base):
@@ -321,7 +330,7 @@ def dumps(scene: description.Scene, base_dir: str | os.PathLike) -> str:
         SceneError: A number is not finite.
     """
     raw = _to_builtins(scene)
-    for steps, item in _containers(raw):
+    for steps, item in containers(raw):
         if isinstance(item.get("file"), str):
             item["file"] = _relative(item["file"], base_dir)
         if not steps and "include" in item:

@@ -34,13 +34,16 @@ TEXTURE_FIELDS = frozenset(
         "base_color",
         *PRINCIPLED_FRACTIONS,
         "opacity",
+        "weight",
+        "normal",
+        "height",
         "radiance",
         "eta",
         "k",
     )
 )
 # Fields in which a string is the name of a BSDF.
-BSDF_FIELDS = frozenset(("bsdf", "front", "back"))
+BSDF_FIELDS = frozenset(("bsdf", "front", "back", "first", "second"))
 # Fields in which a string is the name of a medium.
 MEDIUM_FIELDS = frozenset(("interior", "exterior", "medium"))
 # Long lists of numbers, in which there is no record to find.

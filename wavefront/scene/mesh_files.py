@@ -1,4 +1,4 @@
-"""Mesh files to arrays in the space of the file: PLY, OBJ, glTF and GLB through trimesh, nothing merged or smoothed.
+"""Mesh files to arrays in the space of the file: PLY and OBJ through trimesh, glTF; nothing merged or smoothed.
 
 The format readers of trimesh are called directly, not `trimesh.load`: they give the arrays as they are in the file,
 where a `Trimesh` would compute, cache and copy. Their result is checked against what the file says it has, because
@@ -7,25 +7,24 @@ they leave out silently what they cannot read.
 
 from __future__ import annotations
 
-import base64
 import functools
 import io
-import json
 import os
 import re
-import struct
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import trimesh
-from trimesh.exchange.gltf import load_gltf
 from trimesh.exchange.obj import load_obj
 from trimesh.exchange.ply import load_ply
-from trimesh.resolvers import FilePathResolver
-from trimesh.scene.transforms import SceneGraph
 
 from wavefront.errors import SceneError
+from wavefront.scene import gltf_document
+from wavefront.scene.gltf_accessors import TRIANGLES, read_primitive
+from wavefront.scene.gltf_document import open_document
+from wavefront.scene.gltf_graph import is_flat, world_nodes
+from wavefront.scene.transforms import is_mirror
 
 SUFFIXES = (".ply", ".obj", ".gltf", ".glb")
 
@@ -44,7 +43,7 @@ class _Unreadable(Exception):
     """What is wrong with the content of a file, in words."""
 
 
-def read_mesh(path: str, where: str = "") -> FileMesh:
+def read_mesh(path: str, where: str = "", part: tuple[int, int, int] | None = None) -> FileMesh:
     """Reads a mesh file. All parts of it are merged in file order; glTF node transforms are applied.
 
     The last files read are remembered as long as they do not change on disk, so that a scene that uses a mesh often
@@ -53,6 +52,7 @@ def read_mesh(path: str, where: str = "") -> FileMesh:
     Args:
         path: PLY, OBJ, glTF or GLB file.
         where: Record path that an error names, such as ``shapes[3].file``.
+        part: Mesh, primitive and UV set in a glTF file: this primitive alone, in the space of its mesh.
 
     Raises:
         SceneError: The file is missing, of another type, not readable, or without a triangle.
@@ -64,7 +64,7 @@ def read_mesh(path: str, where: str = "") -> FileMesh:
         stat = os.stat(path)
         if not os.path.isfile(path):
             raise SceneError(f"{path}: not a file", path=where)
-        mesh = _read(os.path.abspath(path), suffix, stat.st_mtime_ns, stat.st_size)
+        mesh = _read(os.path.abspath(path), suffix, part, stat.st_mtime_ns, stat.st_size)
     except FileNotFoundError:
         raise SceneError(f"{path}: file not found", path=where) from None
     except OSError as error:
@@ -77,13 +77,14 @@ def read_mesh(path: str, where: str = "") -> FileMesh:
 def clear_cache() -> None:
     """Lets go of the meshes that `read_mesh` remembers."""
     _read.cache_clear()
+    gltf_document.clear_cache()
 
 
 @functools.lru_cache(maxsize=1024)
-def _read(path, suffix, _mtime, _size):
-    readers = {".ply": _read_ply, ".obj": _read_obj, ".gltf": _read_gltf, ".glb": _read_gltf}
+def _read(path, suffix, part, _mtime, _size):
+    readers = {".ply": _read_ply, ".obj": _read_obj}
     try:
-        mesh = readers[suffix](path)
+        mesh = readers[suffix](path) if suffix in readers else _read_gltf(path, part)
     except (OSError, MemoryError, _Unreadable):
         raise
     except Exception as error:  # trimesh raises whatever its parser stumbles over
@@ -181,69 +182,34 @@ def _has_groups(data):
 # --- glTF ------------------------------------------------------------------------------------------------------
 
 
-def _read_gltf(path):
-    tree = _gltf_tree(Path(path).read_bytes())
-    for primitive in _primitives(tree):
-        # trimesh reads UVs only beside a material, but attributes with an underscore always
-        attributes = primitive.get("attributes", {})
-        if "TEXCOORD_0" in attributes:
-            attributes["_UV"] = attributes["TEXCOORD_0"]
+def _read_gltf(path, part):
     try:
-        data = load_gltf(
-            io.BytesIO(json.dumps(tree).encode()),
-            resolver=FilePathResolver(path),
-            skip_materials=True,
-            merge_primitives=False,
-        )
-    except FileNotFoundError as error:
-        raise _Unreadable(f"needs the file {str(error)!r}, which does not exist") from None
-    graph = SceneGraph(base_frame=data.get("base_frame", "world"))
-    for edge in data["graph"]:
-        graph.update(**edge)
-    parts = []
-    for node in graph.nodes_geometry:
-        matrix, name = graph[node]
-        kwargs = data["geometry"][name]
-        if "faces" not in kwargs:
-            continue  # points and lines
-        parts.append(_gltf_part(kwargs, np.asarray(matrix, np.float64)))
+        document = open_document(path)
+        if part is not None:
+            triangles = read_primitive(document, *part)
+            return FileMesh(triangles.vertices, triangles.faces, triangles.normals, triangles.uvs)
+        parts = [
+            _gltf_part(read_primitive(document, node.mesh, i), matrix)
+            for node, matrix in ((document.root.nodes[i], matrix) for i, matrix in world_nodes(document))
+            if node.mesh is not None and not is_flat(matrix)
+            for i, primitive in enumerate(document.item("meshes", node.mesh, "nodes").primitives)
+            if primitive.mode >= TRIANGLES  # not points or lines
+        ]
+    except SceneError as error:
+        raise _Unreadable(f"{error.path}: {error.message}" if error.path else error.message) from None
     if not parts:
         raise _Unreadable("empty mesh: it has no triangles")
     return _merged(parts)
 
 
-def _gltf_tree(data):
-    """The JSON of a glTF or GLB file; the binary chunk of a GLB becomes a data URI."""
-    if data[:4] != b"glTF":
-        return json.loads(data)
-    chunks, position = {}, 12
-    while position + 8 <= len(data):
-        length, kind = struct.unpack_from("<I4s", data, position)
-        chunks.setdefault(kind, data[position + 8 : position + 8 + length])
-        position += 8 + length
-    tree = json.loads(chunks[b"JSON"])
-    if b"BIN\0" in chunks and tree.get("buffers"):
-        blob = base64.b64encode(chunks[b"BIN\0"]).decode()
-        tree["buffers"][0].setdefault("uri", f"data:application/octet-stream;base64,{blob}")
-    return tree
-
-
-def _primitives(tree):
-    return [primitive for mesh in tree.get("meshes", []) for primitive in mesh.get("primitives", [])]
-
-
-def _gltf_part(kwargs, matrix):
-    vertices = np.asarray(kwargs["vertices"], np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-    faces = _triangles(kwargs["faces"])
-    normals = _floats(kwargs.get("vertex_normals"))
-    if normals is not None:
-        normals = normals @ np.linalg.inv(matrix[:3, :3])
-    if np.linalg.det(matrix[:3, :3]) < 0.0:
-        faces = faces[:, ::-1]
-    uvs = kwargs.get("vertex_attributes", {}).get("_UV")
-    if uvs is not None and uvs.dtype.kind == "u":
-        uvs = uvs / float(np.iinfo(uvs.dtype).max)  # integers stand for [0, 1]
-    return FileMesh(vertices, faces, normals, _floats(uvs))
+def _gltf_part(triangles, matrix):
+    normals = triangles.normals
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is counted where it is rendered
+        vertices = triangles.vertices @ matrix[:3, :3].T + matrix[:3, 3]
+        if normals is not None:
+            normals = normals @ np.linalg.inv(matrix[:3, :3])
+    faces = triangles.faces[:, ::-1] if is_mirror(matrix) else triangles.faces
+    return FileMesh(vertices, faces, normals, triangles.uvs)
 
 
 def _merged(parts):

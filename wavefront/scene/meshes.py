@@ -106,6 +106,18 @@ def tessellate(shape: description.AnyShape, where: str = "") -> TriangleMesh:
     )
 
 
+def own_space(shape: description.Mesh, where: str = "") -> TriangleMesh:
+    """The triangles of a mesh as they are given, in 32-bit floats: not transformed, none left out, normals as they are.
+
+    Raises:
+        SceneError: As `tessellate` does, but for what that finds after the transform.
+    """
+    vertices, faces, normals, uvs, _ = _mesh_arrays(shape, where)
+    with np.errstate(over="ignore"):
+        vertices, normals, uvs = (a if a is None else a.astype(np.float32) for a in (vertices, normals, uvs))
+    return TriangleMesh(vertices, faces.astype(np.int32), normals, uvs)
+
+
 def has_file_normals(path: str, where: str = "") -> bool:
     """Whether a mesh file has vertex normals. Raises SceneError as `tessellate` does."""
     return _read_mesh(path, where).normals is not None
@@ -117,11 +129,11 @@ def clear_cache() -> None:
         mesh_files.clear_cache()
 
 
-def _read_mesh(path, where):
+def _read_mesh(path, where, part=None):
     # Imported here, since trimesh takes most of a second to import and scenes without mesh files need none of it.
     from wavefront.scene.mesh_files import read_mesh
 
-    return read_mesh(path, where)
+    return read_mesh(path, where, part)
 
 
 # --- meshes ----------------------------------------------------------------------------------------------------
@@ -147,7 +159,8 @@ def _mesh_arrays(shape, where):
             if getattr(shape, name) is not None:
                 raise SceneError(f"{name} are for inline vertices; the file has its own", path=f"{where}.{name}")
         source = f"{where}.file"
-        data = _read_mesh(shape.file, source)
+        part = shape.part and (shape.part.mesh, shape.part.primitive, shape.part.uv_set)
+        data = _read_mesh(shape.file, source, part)
         vertices, faces, normals, uvs = data.vertices, data.faces, data.normals, data.uvs
         names = dict.fromkeys(("vertices", "faces", "normals", "uvs"), source)
         where = source
@@ -301,7 +314,7 @@ def write_ply(path: str | os.PathLike, mesh: TriangleMesh) -> None:
         columns += [(name, mesh.uvs[:, i]) for i, name in enumerate("st")]
     table = np.empty(len(mesh.vertices), [(name, "<f4") for name, _ in columns])
     for name, values in columns:
-        table[name] = values
+        table[name] = values + np.float32(0.0)  # no minus zeros, which a reader may or may not keep
     faces = np.empty(len(mesh.faces), [("count", "u1"), ("indices", "<i4", (3,))])
     faces["count"], faces["indices"] = 3, mesh.faces
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]

@@ -21,6 +21,7 @@ import numpy as np
 from wavefront.errors import SceneError
 from wavefront.scene import transforms
 from wavefront.scene.mitsuba_values import STEP_TAGS, Element, nearest, to_matrix, to_number, to_xyz
+from wavefront.scene.transforms import rows as rows  # for the importers of what is in a document
 
 OBJECT_TAGS = (
     "scene", "bsdf", "emitter", "film", "integrator", "medium", "phase", "rfilter", "sampler", "sensor", "shape",
@@ -292,11 +293,6 @@ def world_matrix(plugin: Plugin) -> np.ndarray:
     except SceneError as error:
         raise element.error(error.message) from None
     return matrix
-
-
-def rows(matrix: np.ndarray) -> list[tuple[float, ...]]:
-    """A matrix as a transform record."""
-    return [tuple(float(value) + 0.0 for value in row) for row in matrix]  # + 0.0: no minus zeros
 
 
 def _check_references(document):

@@ -26,6 +26,19 @@ def rgb(value) -> np.ndarray:
     return np.broadcast_to(np.asarray(value, np.float64), 3)
 
 
+def load_bitmap(texture: description.Bitmap, where: str) -> np.ndarray:
+    """Pixels of the image of a record, or of its one channel, as `load_image` gives them. Raises SceneError as that."""
+    if texture.image is None:
+        pixels = load_image(texture.file, where, alpha=texture.channel == "a")
+    else:
+        from wavefront.scene.gltf_images import load_embedded  # only here: hardly any scene needs it
+
+        pixels = load_embedded(texture.file, texture.image, where, alpha=texture.channel == "a")
+    if texture.channel in (None, "a"):
+        return pixels
+    return np.ascontiguousarray(pixels[:, :, min("rgb".index(texture.channel), pixels.shape[2] - 1), None])
+
+
 class TextureAtlas:
     """Collects the textures that parameters refer to, each image once."""
 
@@ -35,7 +48,7 @@ class TextureAtlas:
         self.means: list[np.ndarray] = []
         self.pixels: dict[str, list[np.ndarray]] = {kind: [] for kind in IMAGE_TYPES}
         self.known: dict[tuple, int] = {}
-        self.images: dict[tuple[str, bool], tuple[str, int, np.ndarray]] = {}
+        self.images: dict[tuple, tuple[str, int, np.ndarray]] = {}
         self.references = 0  # of parameters to textures so far
 
     def parameter(self, scene: description.Scene, value, where: str, scalar: bool = False) -> tuple[object, int]:
@@ -44,7 +57,7 @@ class TextureAtlas:
         if isinstance(value, (description.Bitmap, description.Checkerboard)):
             self.references += 1
             return (1.0 if scalar else np.ones(3)), self.add(value, where, scalar)
-        return (float(value) if scalar else rgb(value)), -1
+        return (float(value) if scalar and np.ndim(value) == 0 else rgb(value)), -1
 
     def add(self, texture: description.Texture, where: str, scalar: bool) -> int:
         """Index of a texture; `scalar` textures hold numbers, not colours, unless they say otherwise."""
@@ -64,10 +77,11 @@ class TextureAtlas:
         return self.known[key]
 
     def _add_bitmap(self, texture: description.Bitmap, where: str, scalar: bool, rows: dict):
-        decode = texture.color_space == "srgb"
-        kind, first, pixels = self._image(texture.file, decode, where)
+        decode = texture.color_space == "srgb" and texture.channel != "a"  # alpha is linear in all formats
+        kind, first, pixels = self._image(texture, decode, where)
         integer = pixels.dtype.kind == "u"
-        srgb = integer and (decode or (texture.color_space == "auto" and not scalar))
+        number = scalar or texture.channel is not None
+        srgb = integer and (decode or (texture.color_space == "auto" and not number))
         record = {
             "kind": KINDS[kind],
             "first": first,
@@ -77,21 +91,22 @@ class TextureAtlas:
             "srgb": int(srgb),
             "nearest": int(texture.filter == "nearest"),
             "wrap": WRAP_MODES[texture.wrap],
-            "scale": texture.scale,
+            "scale": rgb(texture.scale),
         }
-        self._append(kind, rows | record, texture.scale * np.broadcast_to(_mean(pixels, srgb), 3))
+        self._append(kind, rows | record, rgb(texture.scale) * np.broadcast_to(_mean(pixels, srgb), 3))
 
-    def _image(self, file: str, decode: bool, where: str) -> tuple[str, int, np.ndarray]:
-        """Kind, first value in the array of the kind, and pixels of a file, which is stored once.
+    def _image(self, texture: description.Bitmap, decode: bool, where: str) -> tuple[str, int, np.ndarray]:
+        """Kind, first value in the array of the kind, and pixels of an image, which is stored once.
 
         `decode`: floats are sRGB-encoded; they are stored linear.
         """
-        if (file, decode) in self.images:
-            return self.images[file, decode]
-        stored = self.images.get((file, not decode))
+        file, key = texture.file, (texture.file, texture.image, texture.channel, decode)
+        if key in self.images:
+            return self.images[key]
+        stored = self.images.get((*key[:-1], not decode))
         if stored is not None and stored[2].dtype.kind == "u":  # integers are stored as encoded
             return stored
-        pixels = load_image(file, where)
+        pixels = load_bitmap(texture, where)
         if pixels.shape[0] * pixels.shape[1] > np.iinfo(np.int32).max:
             found = f"{pixels.shape[1]}x{pixels.shape[0]}"
             raise SceneError(f"{file}: a texture has at most 2^31 - 1 pixels; found {found}", path=where)
@@ -104,9 +119,9 @@ class TextureAtlas:
                 pixels = srgb_to_linear(np.maximum(pixels.astype(np.float64), 0.0)).astype(np.float32)
         kind = next(name for name, dtype in IMAGE_TYPES.items() if dtype == pixels.dtype)
         store = self.pixels[kind]
-        self.images[file, decode] = kind, sum(part.size for part in store), pixels
+        self.images[key] = kind, sum(part.size for part in store), pixels
         store.append(pixels.ravel())
-        return self.images[file, decode]
+        return self.images[key]
 
     def _append(self, kind: str, record: dict, mean: np.ndarray):
         self.records.append(record)

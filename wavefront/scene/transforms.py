@@ -49,6 +49,11 @@ def check_invertible(matrix: np.ndarray, where: str = "") -> None:
         raise SceneError("the transform is not invertible (it flattens space); check for a scale of 0", path=where)
 
 
+def rows(matrix: np.ndarray) -> list[tuple[float, ...]]:
+    """A matrix as a transform record."""
+    return [tuple(float(value) + 0.0 for value in row) for row in matrix]  # + 0.0: no minus zeros
+
+
 def is_mirror(matrix: np.ndarray) -> bool:
     """Whether the (4, 4) matrix turns a right-handed frame into a left-handed one."""
     return bool(np.linalg.slogdet(matrix[:3, :3])[0] < 0.0)

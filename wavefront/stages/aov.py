@@ -19,18 +19,16 @@ def to_double(v: wp.vec3) -> wp.vec3d:
 
 
 @functools.cache
-def make_aov(
-    arrays: tuple[str, ...], bsdfs: tuple[str, ...], mask: bool, textures: tuple[str, ...], uvs: bool, tangents: bool
-):
+def make_aov(arrays: tuple[str, ...], bsdfs: tuple[str, ...], mask: bool, textures: tuple[str, ...], uvs: bool):
     """Kernel of the stage, one thread per pixel, launched after the camera rays' intersection.
 
     A hit is the first surface on a ray, however transparent. A ray that escapes adds zero to each sum.
 
     Args:
         arrays: Subset of `wavefront.film.FIRST_HIT`: the arrays of the film to fill.
-        bsdfs, mask, textures, uvs, tangents: Fields of `Features`.
+        bsdfs, mask, textures, uvs: Fields of `Features`.
     """
-    _, _, eval_albedo = make_bsdf(bsdfs, mask, textures, tangents)
+    _, _, eval_albedo = make_bsdf(bsdfs, mask, textures, False, False)
 
     @wp.kernel(enable_backward=False, module="unique")
     def accumulate_aovs(

@@ -19,6 +19,7 @@ def make_intersect(
     smooth: bool,
     uvs: bool,
     tangents: bool,
+    bumps: bool,
     area_lights: bool,
     escape_lights: bool,
     shape_index: bool = False,
@@ -29,7 +30,7 @@ def make_intersect(
     `shape_index`: whether the index of the shape is an AOV.
     """
     closest_hit, _ = make_intersector(triangles, spheres)
-    vertex_of = make_vertex(triangles, spheres, smooth, uvs, tangents)
+    vertex_of = make_vertex(triangles, spheres, smooth, uvs, tangents, bumps)
 
     @wp.kernel(enable_backward=False, module="unique")
     def closest_hits(
@@ -78,6 +79,8 @@ def make_intersect(
             surfaces.uv[slot] = vertex.uv
         if wp.static(tangents):
             surfaces.tangent[slot] = vertex.tangent
+        if wp.static(bumps):
+            surfaces.uv_jacobian[slot] = vertex.uv_jacobian
         if wp.static(shape_index):
             surfaces.shape[slot] = shape.index
         if wp.static(media):
