@@ -17,7 +17,7 @@ SCENE = """<scene version="0.6.0">
 <default name="haze" value="3"/>
 <integrator type="path"><integer name="maxDepth" value="2"/></integrator>
 <sensor type="perspective"><float name="fov" value="50"/>
-  <transform name="toWorld"><lookat origin="0,3,4" target="0,0,0" up="0,1,0"/></transform></sensor>
+  <transform name="toWorld"><lookat origin="0,3,4" target="0,3,0" up="0,1,0"/></transform></sensor>
 <shape type="obj"><string name="filename" value="floor.obj"/>
   <bsdf type="diffuse"><rgb name="reflectance" value="0.5, 0.5, 0.5"/></bsdf></shape>
 <emitter type="sunsky">
@@ -109,14 +109,15 @@ def test_both_renderers_see_the_same_baked_light(folder, baked, theirs):
     image = Renderer(scene, threads=1, seed=5).render(1024).astype(np.float64)
     peer.use_variant("llvm_ad_rgb")
     others = [peer.render(peer.load_xml(file, 16, 16), 1024, max_depth=2) for file in (path, folder / "scene.xml")]
-    # The floor is evenly lit, so its pixels differ by noise alone; the top rows look past it.
-    floor = [x[8:].reshape(-1, 3) for x in (image, *others)]
+    # The floor is evenly lit, so its pixels differ by noise alone; the upper rows see the sky.
+    floor = [x[13:].reshape(-1, 3) for x in (image, *others)]
     means = [x.mean() for x in floor]
     errors = [x.mean(axis=1).std() / np.sqrt(len(x)) for x in floor]
     assert abs(means[0] - means[1]) < 3.89 * np.hypot(errors[0], errors[1])
-    assert max(errors) < 2e-3 * means[0]
+    assert max(errors[:2]) < 2.5e-3 * means[0]  # so that 1.4 % would be seen
     assert means[1] == pytest.approx(means[2], rel=1e-2)
-    np.testing.assert_allclose(image[:2].mean(axis=(0, 1)), others[0][:2].mean(axis=(0, 1)), rtol=1e-3)
+    np.testing.assert_allclose(image[:7], others[0][:7], rtol=2e-3)
+    np.testing.assert_allclose(image[:7], others[1][:7], rtol=5e-3)
 
 
 def test_parts_that_are_off(folder, tmp_path):
