@@ -549,16 +549,12 @@ AnyShape = Mesh | Rectangle | Cube | Disk | Sphere
 # --- camera, film, integrator ------------------------------------------------------------------------------------
 
 
-class CameraRecord(Record):
-    """What all cameras share."""
-
-    to_world: Transform = []
-    medium: Annotated[
-        str | Medium | None, Meta(description="Name of a medium, or a medium, that the camera is in; default: vacuum.")
-    ] = None
+CameraMedium = Annotated[
+    str | Medium | None, Meta(description="Name of a medium, or a medium, that the camera is in; default: vacuum.")
+]
 
 
-class Perspective(CameraRecord, tag_field="type", tag="perspective"):
+class Perspective(Record, tag_field="type", tag="perspective"):
     """Pinhole camera."""
 
     fov: Annotated[float, Meta(gt=0.0, lt=180.0, description="Field of view along fov_axis, degrees.")] = 40.0
@@ -566,6 +562,8 @@ class Perspective(CameraRecord, tag_field="type", tag="perspective"):
     principal_point_offset: Annotated[
         Vec2, Meta(description="Moves the image to the left and up, in fractions of the film's width and height.")
     ] = (0.0, 0.0)
+    to_world: Transform = []
+    medium: CameraMedium = None
 
 
 class ThinLens(Perspective, kw_only=True, tag_field="type", tag="thin_lens"):
@@ -579,10 +577,12 @@ class ThinLens(Perspective, kw_only=True, tag_field="type", tag="thin_lens"):
     ]
 
 
-class Orthographic(CameraRecord, tag_field="type", tag="orthographic"):
+class Orthographic(Record, tag_field="type", tag="orthographic"):
     """Camera of parallel rays, which start on its film at local z = 0."""
 
     width: Annotated[Positive, Meta(description="Width of the film in metres, before to_world.")] = 2.0
+    to_world: Transform = []
+    medium: CameraMedium = None
 
 
 Camera = Perspective | ThinLens | Orthographic
