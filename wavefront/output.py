@@ -151,7 +151,7 @@ def describe_render(renderer: Renderer, source: str, started: float) -> dict:
 def exr_attributes(renderer: Renderer, account: dict) -> dict[str, int | float | str]:
     """What the header of OUT.exr says of the render.
 
-    ``samplesPerPixel`` (int), ``seed`` (text: it has 64 bits), ``sceneSHA256``, ``software`` and ``pixelAspectRatio``.
+    ``samplesPerPixel`` (int), ``seed`` (text: it has 64 bits), ``sceneSHA256``, ``Software`` and ``pixelAspectRatio``.
     """
     return {
         "samplesPerPixel": renderer.sample_count,
