@@ -16,6 +16,7 @@ import warp as wp
 from wavefront.accel.mesh_query import INFINITE, Geometry, make_intersector
 from wavefront.bsdf.dispatch import is_smooth, make_bsdf
 from wavefront.bsdf.frame import ShadingFrame
+from wavefront.bsdf.maps import make_mapped_frame
 from wavefront.bsdf.tables import KINDS as BSDF_KINDS
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.camera import Camera, camera_ray, make_camera
@@ -49,11 +50,12 @@ class Settings:
 
 
 @functools.cache
-def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool, tangents: bool, nee: bool):
+def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool, tangents: bool, maps: bool, nee: bool):
     """Only what a scene lacks memory for is left out: kinds of primitive, vertex normals, UVs, tables of sampling."""
     closest_hit, occluded = make_intersector(triangles, spheres)
-    vertex_of = make_vertex(triangles, spheres, smooth, uvs, tangents)
-    eval_bsdf, sample_bsdf, _ = make_bsdf(tuple(sorted(BSDF_KINDS)), True, TEXTURES, tangents)
+    vertex_of = make_vertex(triangles, spheres, smooth, uvs, tangents, maps)
+    eval_bsdf, sample_bsdf, _ = make_bsdf(tuple(sorted(BSDF_KINDS)), True, TEXTURES, tangents, maps)
+    mapped_frame = make_mapped_frame(TEXTURES, True)
     sample_light, light_pdf = make_light_sampler(LIGHTS, TEXTURES)
     eval_envmap, _ = make_envmap(False, nee)
     eval_parameter = make_eval_parameter(TEXTURES)
@@ -140,6 +142,8 @@ def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool, tan
             frame = ShadingFrame()
             frame.normal = vertex.shading_normal
             frame.tangent = vertex.tangent
+            if wp.static(maps):
+                frame = mapped_frame(materials, textures, shape.material, vertex, wo)
             facing = is_smooth(materials.materials[shape.material], wp.dot(frame.normal, wo))
             if settings.nee == 1 and facing and lights.lights.shape[0] > 0:
                 u = uniform4(seed, key, sample, segment - 1, PURPOSE_LIGHT)
@@ -191,7 +195,7 @@ def render_megakernel(renderer: Renderer, spp: int) -> np.ndarray:
     settings.seed = renderer.seed
     n = film.width * film.height * spp
     result = wp.zeros(n, dtype=wp.vec3, device="cpu")
-    kernel = make_megakernel(f.triangles, f.spheres, f.smooth, f.uvs, f.tangents, f.nee)
+    kernel = make_megakernel(f.triangles, f.spheres, f.smooth, f.uvs, f.tangents, bool(f.maps), f.nee)
     d = device_scene
     inputs = [make_camera(scene.camera, film), d.geometry, d.materials, d.textures, d.lights, settings]
     wp.launch(kernel, dim=n, inputs=inputs, outputs=[result], device="cpu")

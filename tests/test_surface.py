@@ -13,8 +13,8 @@ CHUNK = 200  # triangles in one mesh: a cloud of all scales overlaps too much fo
 
 closest_triangle, _ = make_intersector(True, False)
 closest_sphere, _ = make_intersector(False, True)
-triangle_vertex = make_vertex(True, False, True, True, True)
-sphere_vertex = make_vertex(False, True, False, True, True)
+triangle_vertex = make_vertex(True, False, True, True, True, True)
+sphere_vertex = make_vertex(False, True, False, True, True, True)
 
 
 @wp.kernel(enable_backward=False, module="unique")

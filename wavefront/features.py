@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from wavefront.bsdf.tables import DELTA
+from wavefront.bsdf.tables import BLENDS, DELTA
 from wavefront.light import tables
 
 
@@ -22,6 +22,7 @@ class Features:
 
     # Materials
     bsdfs: tuple[str, ...]  # kinds, sorted
+    maps: tuple[str, ...]  # kinds of map that turn shading frames, sorted: bump, normal
     mask: bool  # some material is not opaque
     textures: tuple[str, ...]  # kinds, sorted
 
@@ -44,7 +45,7 @@ class Features:
     @property
     def smooth_bsdfs(self) -> bool:
         """Whether a light sample can contribute anywhere."""
-        return any(kind not in DELTA for kind in self.bsdfs)
+        return any(kind not in (*DELTA, *BLENDS) for kind in self.bsdfs)
 
     @property
     def escape_lights(self) -> tuple[str, ...]:

@@ -32,6 +32,7 @@ from wavefront.stages.emission import make_emission
 from wavefront.stages.escaped import make_escaped
 from wavefront.stages.generate import make_generate
 from wavefront.stages.intersect import make_intersect
+from wavefront.stages.perturb import make_perturb
 from wavefront.stages.scatter import make_scatter
 from wavefront.stages.shadow import make_shadow
 
@@ -52,6 +53,7 @@ def make_features(scene: description.Scene, device_scene: DeviceScene) -> Featur
         uvs=bool(device_scene.texture_kinds),
         tangents=device_scene.tangents,
         bsdfs=device_scene.bsdfs,
+        maps=device_scene.maps,
         mask=device_scene.mask,
         textures=device_scene.texture_kinds,
         lights=device_scene.light_kinds,
@@ -70,6 +72,7 @@ class Kernels:
 
     generate: wp.Kernel
     intersect: wp.Kernel
+    perturb: wp.Kernel | None
     escaped: wp.Kernel | None
     emission: wp.Kernel | None
     aov: wp.Kernel | None
@@ -90,17 +93,18 @@ def make_kernels(f: Features) -> Kernels:
     return Kernels(
         generate=make_generate(f.filter, f.transmission),
         intersect=make_intersect(
-            f.triangles, f.spheres, f.smooth, f.uvs, f.tangents, f.area_lights, bool(f.escape_lights)
+            f.triangles, f.spheres, f.smooth, f.uvs, f.tangents, "bump" in f.maps, f.area_lights, bool(f.escape_lights)
         ),
+        perturb=make_perturb(f.textures, f.uvs, "bump" in f.maps) if f.maps else None,
         escaped=make_escaped(f.escape_lights, f.light_sampling) if f.escape_lights else None,
         emission=make_emission(f.lights, f.light_textures, f.light_sampling) if f.area_lights else None,
-        aov=make_aov(f.aovs, f.bsdfs, f.mask, f.textures, f.uvs, f.tangents) if f.aovs else None,
-        direct=make_direct(f.bsdfs, f.mask, f.textures, f.lights, f.light_textures, f.uvs, f.tangents)
+        aov=make_aov(f.aovs, f.bsdfs, f.mask, f.textures, f.uvs) if f.aovs else None,
+        direct=make_direct(f.bsdfs, f.mask, f.textures, f.lights, f.light_textures, f.uvs, f.tangents, f.maps)
         if f.light_sampling
         else None,
         shadow=make_shadow(f.triangles, f.spheres) if f.light_sampling else None,
         drain=drain_rays,
-        scatter=make_scatter(f.bsdfs, f.mask, f.textures, f.uvs, f.tangents, f.transmission, f.roulette),
+        scatter=make_scatter(f.bsdfs, f.mask, f.textures, f.uvs, f.tangents, f.maps, f.transmission, f.roulette),
         advance=advance_bounce,
         accumulate=make_accumulate(f.variance),
     )
@@ -108,7 +112,14 @@ def make_kernels(f: Features) -> Kernels:
 
 def skipped_arrays(f: Features) -> dict[type, tuple[str, ...]]:
     """Arrays of the path state that the features do without."""
-    surface_arrays = {"uv": f.uvs, "tangent": f.tangents, "light": f.area_lights}
+    surface_arrays = {
+        "uv": f.uvs,
+        "tangent": f.tangents,
+        "uv_jacobian": "bump" in f.maps,
+        "base_normal": bool(f.maps),
+        "terminator": bool(f.maps),
+        "light": f.area_lights,
+    }
     return {
         Paths: () if f.transmission else ("eta",),
         Surfaces: tuple(name for name, used in surface_arrays.items() if not used),
@@ -180,6 +191,7 @@ class Worker:
         arguments = {
             "generate": [camera, tile, width, scale, seed, paths, rays, counters, totals],
             "intersect": [geometry, paths, rays, max_depth, surfaces, hits, escaped, emissive, counters],
+            "perturb": [materials, textures, paths, rays, surfaces],
             "escaped": [lights, paths, escaped, counters],
             "emission": [geometry, lights, textures, paths, surfaces, emissive, counters],
             "aov": [materials, textures, paths, surfaces, tile, width, sums],
@@ -232,6 +244,7 @@ class Worker:
 
     def _bounce(self, aov_pixels: int = 0) -> None:
         self._launch("intersect", "rays")
+        self._launch("perturb", "rays")
         self._launch("escaped", "escaped")
         self._launch("emission", "emissive")
         self._launch("aov", aov_pixels)

@@ -88,8 +88,11 @@ class Surfaces:
     position: wp.array[wp.vec3]
     geometric_normal: wp.array[wp.vec3]  # on the side of the shading normal
     shading_normal: wp.array[wp.vec3]
-    tangent: wp.array[wp.vec3]  # along growing u, unit length, orthogonal to the shading normal; allocated if some BSDF
-    # depends on it
+    # Unit length, orthogonal to the shading normal, along growing u; allocated if a BSDF or a map depends on it.
+    tangent: wp.array[wp.vec3]
+    uv_jacobian: wp.array[wp.vec3]  # see `surface.Vertex`; allocated if there are bump maps
+    base_normal: wp.array[wp.vec3]  # shading normal before bump or normal maps; allocated if there are such
+    terminator: wp.array[wp.float32]  # see `bsdf.frame.base_shadowing`; allocated as the base normal
     offset: wp.array[wp.float32]  # how far along the geometric normal a ray must start, in metres
     uv: wp.array[wp.vec2]  # allocated if a texture is looked up
     material: wp.array[wp.int32]  # -1 where the ray escaped

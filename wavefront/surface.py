@@ -23,7 +23,8 @@ class Vertex:
     shading_normal: wp.vec3
     offset: wp.float32
     uv: wp.vec2
-    tangent: wp.vec3  # unit length, along growing u
+    tangent: wp.vec3  # s: unit length, orthogonal to the shading normal n, along growing u
+    uv_jacobian: wp.vec3  # (a, b, c): in the plane of s and t = n x s, dp/du is a s and dp/dv is b s + c t
 
 
 @wp.func
@@ -68,17 +69,19 @@ def sphere_uv(normal: wp.vec3) -> wp.vec2:
 
 
 @wp.func
-def triangle_dp_du(v0: wp.vec3, v1: wp.vec3, v2: wp.vec3, uv0: wp.vec2, uv1: wp.vec2, uv2: wp.vec2) -> wp.vec3:
-    """Direction in which u grows and v does not, of any length; without UVs to tell it, that of the first edge."""
-    scale = 1.0 / triangle_extent(v0, v1, v2)
-    e1 = (v1 - v0) * scale
-    e2 = (v2 - v0) * scale
-    d1 = uv1 - uv0
-    d2 = uv2 - uv0
+def uv_partials(e1: wp.vec3, e2: wp.vec3, d1: wp.vec2, d2: wp.vec2):
+    """dp/du and dp/dv of a triangle, both divided by the third result, from the edges e and their differences d of UV.
+
+    Where UVs do not tell them, dp/du is the first edge, as in Mitsuba 3, and dp/dv zero.
+    """
     det = d1[0] * d2[1] - d1[1] * d2[0]
+    sign = wp.sign(det)
+    along_u = sign * (d2[1] * e1 - d1[1] * e2)
+    along_v = sign * (d1[0] * e2 - d2[0] * e1)
     if det == 0.0 or not wp.isfinite(det):
-        return e1
-    return wp.sign(det) * (d2[1] * e1 - d1[1] * e2)
+        along_u = e1
+        along_v = wp.vec3(0.0)
+    return along_u, along_v, 1.0 / wp.abs(det)
 
 
 @wp.func
@@ -93,8 +96,15 @@ def tangent_along(normal: wp.vec3, dp_du: wp.vec3) -> wp.vec3:
     return s
 
 
+@wp.func
+def in_frame(vertex: Vertex, along_u: wp.vec3, along_v: wp.vec3) -> wp.vec3:
+    """The three numbers of `Vertex.uv_jacobian`."""
+    t = wp.cross(vertex.shading_normal, vertex.tangent)
+    return wp.vec3(wp.dot(along_u, vertex.tangent), wp.dot(along_v, vertex.tangent), wp.dot(along_v, t))
+
+
 @functools.cache
-def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool, tangents: bool):
+def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool, tangents: bool, bumps: bool):
     """`make_vertex(geometry, origin, direction, hit) -> Vertex` for a hit that exists.
 
     Args:
@@ -102,7 +112,8 @@ def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool, tangent
         spheres: The scene has spheres.
         smooth: Some mesh has vertex normals.
         uvs: Some texture is looked up.
-        tangents: Some BSDF depends on the direction of its tangent.
+        tangents: Some BSDF or map depends on the direction of the tangent.
+        bumps: There are bump maps, for which dp/du and dp/dv are needed.
     """
 
     @wp.func
@@ -132,8 +143,17 @@ def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool, tangent
                 if wp.static(uvs):
                     vertex.uv = hit.u * geometry.uvs[i0] + hit.v * geometry.uvs[i1] + b2 * geometry.uvs[i2]
                 if wp.static(tangents):
-                    dp_du = triangle_dp_du(v0, v1, v2, geometry.uvs[i0], geometry.uvs[i1], geometry.uvs[i2])
-                    vertex.tangent = tangent_along(vertex.shading_normal, dp_du)
+                    extent = triangle_extent(v0, v1, v2)
+                    d1 = geometry.uvs[i1] - geometry.uvs[i0]
+                    d2 = geometry.uvs[i2] - geometry.uvs[i0]
+                    along_u, along_v, scale = uv_partials((v1 - v0) / extent, (v2 - v0) / extent, d1, d2)
+                    vertex.tangent = tangent_along(vertex.shading_normal, along_u)
+                    if wp.static(bumps):
+                        if geometry.shapes[geometry.shape_of[hit.primitive]].polar == 1:
+                            # The length of dp/dv that the triangles of a disk give is that at its rim, where u is 1.
+                            u = hit.u * geometry.uvs[i0][0] + hit.v * geometry.uvs[i1][0] + b2 * geometry.uvs[i2][0]
+                            along_v *= u
+                        vertex.uv_jacobian = (extent * scale) * in_frame(vertex, along_u, along_v)
         if wp.static(spheres):
             if hit.primitive >= geometry.triangle_count:
                 index = hit.primitive - geometry.triangle_count
@@ -152,8 +172,14 @@ def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool, tangent
                 if wp.static(tangents):
                     to_local = geometry.sphere_to_local[index]
                     local = to_local * outwards
-                    dp_du = wp.transpose(to_local) * wp.vec3(-local[1], local[0], 0.0)
-                    vertex.tangent = tangent_along(vertex.shading_normal, dp_du)
+                    along_u = wp.transpose(to_local) * wp.vec3(-local[1], local[0], 0.0)
+                    vertex.tangent = tangent_along(vertex.shading_normal, along_u)
+                    if wp.static(bumps):
+                        # From the pole (0, 0, 1) down, at half the speed of u.
+                        along_v = wp.transpose(to_local) * wp.vec3(0.0, 0.0, -1.0)
+                        along_v = wp.normalize(along_v - wp.dot(along_v, outwards) * outwards)
+                        scale = wp.static(wp.pi) * sphere[3]
+                        vertex.uv_jacobian = scale * in_frame(vertex, 2.0 * along_u, along_v)
         return vertex
 
     return vertex_of

@@ -11,6 +11,8 @@ import functools
 import numpy as np
 import warp as wp
 
+from wavefront.film import LUMINANCE
+
 KIND_CHECKERBOARD = wp.constant(0)
 KIND_BYTES = wp.constant(1)
 KIND_FLOATS = wp.constant(2)
@@ -18,6 +20,7 @@ KIND_FLOATS = wp.constant(2)
 WRAP_REPEAT = wp.constant(0)
 WRAP_MIRROR = wp.constant(1)
 WRAP_CLAMP = wp.constant(2)
+_RED, _BLUE = wp.constant(LUMINANCE[0]), wp.constant(LUMINANCE[2])
 WRAP_MODES = {"repeat": 0, "mirror": 1, "clamp": 2}
 
 
@@ -51,6 +54,12 @@ def srgb_to_linear(value: np.ndarray) -> np.ndarray:
 
 
 @wp.func
+def luminance(rgb: wp.vec3) -> float:
+    """Of linear Rec. 709; that of a grey is its value to the last bit."""
+    return rgb[1] + _RED * (rgb[0] - rgb[1]) + _BLUE * (rgb[2] - rgb[1])
+
+
+@wp.func
 def wrap_coordinate(i: int, size: int, mode: int) -> int:
     """Index of the pixel that coordinate `i` falls on; `i` may be any integer."""
     if mode == WRAP_CLAMP:
@@ -65,16 +74,39 @@ def wrap_coordinate(i: int, size: int, mode: int) -> int:
     return wp.where(m < 0, m + size, m)
 
 
+@wp.func
+def texture_uv(record: TextureRecord, surface_uv: wp.vec2) -> wp.vec2:
+    uv1 = wp.vec3(surface_uv[0], surface_uv[1], 1.0)
+    return wp.vec2(wp.dot(record.uv_row0, uv1), wp.dot(record.uv_row1, uv1))
+
+
+@wp.func
+def pixel_position(record: TextureRecord, uv: wp.vec2) -> wp.vec2:
+    """Where `uv`, which is finite, falls on a bitmap, in pixels.
+
+    Whole periods of the largest wrap mode are taken off first, so that the product with the size is exact enough and
+    fits an int however far the coordinate is.
+    """
+    u = uv[0]
+    v = uv[1]
+    if record.wrap == WRAP_CLAMP:
+        u = wp.clamp(u, -1.0, 2.0)
+        v = wp.clamp(v, -1.0, 2.0)
+    else:
+        u -= 2.0 * wp.floor(0.5 * u)
+        v -= 2.0 * wp.floor(0.5 * v)
+    return wp.vec2(u * float(record.width), v * float(record.height))
+
+
 @functools.cache
-def make_eval_texture(kinds: tuple[str, ...]):
-    """`eval_texture(tables, texture, uv) -> vec3` for the kinds of texture in a scene.
+def make_fetch(kinds: tuple[str, ...]):
+    """`fetch(tables, record, x, y) -> vec3`: a pixel of a bitmap, linear; any integers are wrapped.
 
     Args:
-        kinds: Subset of ``("bytes", "checkerboard", "floats")``.
+        kinds: As for `make_eval_texture`.
     """
     has_bytes = "bytes" in kinds
     has_floats = "floats" in kinds
-    has_checkerboard = "checkerboard" in kinds
 
     @wp.func
     def fetch(tables: TextureTables, record: TextureRecord, x: int, y: int) -> wp.vec3:
@@ -102,34 +134,37 @@ def make_eval_texture(kinds: tuple[str, ...]):
                     rgb = wp.vec3(grey, tables.floats[i + wp.int64(1)], tables.floats[i + wp.int64(2)])
         return rgb
 
+    return fetch
+
+
+@functools.cache
+def make_eval_texture(kinds: tuple[str, ...]):
+    """`eval_texture(tables, texture, uv) -> vec3` for the kinds of texture in a scene.
+
+    Args:
+        kinds: Subset of ``("bytes", "checkerboard", "floats")``.
+    """
+    bitmaps = "bytes" in kinds or "floats" in kinds
+    has_checkerboard = "checkerboard" in kinds
+    fetch = make_fetch(kinds)
+
     @wp.func
     def eval_texture(tables: TextureTables, texture: int, surface_uv: wp.vec2) -> wp.vec3:
         record = tables.records[texture]
-        uv1 = wp.vec3(surface_uv[0], surface_uv[1], 1.0)
-        u = wp.dot(record.uv_row0, uv1)
-        v = wp.dot(record.uv_row1, uv1)
-        if not wp.isfinite(u + v):
+        uv = texture_uv(record, surface_uv)
+        if not wp.isfinite(uv[0] + uv[1]):
             return wp.vec3(0.0)
         if wp.static(has_checkerboard):
             if record.kind == KIND_CHECKERBOARD:
-                in_left = u - wp.floor(u) < 0.5
-                in_top = v - wp.floor(v) < 0.5
+                in_left = uv[0] - wp.floor(uv[0]) < 0.5
+                in_top = uv[1] - wp.floor(uv[1]) < 0.5
                 return wp.where(in_left == in_top, record.color0, record.color1)
-        if wp.static(has_bytes or has_floats):
-            # Whole periods of the largest wrap mode are taken off first, so that the product with the size is exact
-            # enough and fits an int however far the coordinate is.
-            if record.wrap == WRAP_CLAMP:
-                u = wp.clamp(u, -1.0, 2.0)
-                v = wp.clamp(v, -1.0, 2.0)
-            else:
-                u -= 2.0 * wp.floor(0.5 * u)
-                v -= 2.0 * wp.floor(0.5 * v)
-            x = u * float(record.width)
-            y = v * float(record.height)
+        if wp.static(bitmaps):
+            position = pixel_position(record, uv)
             if record.nearest == 1:
-                return fetch(tables, record, int(wp.floor(x)), int(wp.floor(y)))
-            x -= 0.5  # pixel centres are at half-integers
-            y -= 0.5
+                return fetch(tables, record, int(wp.floor(position[0])), int(wp.floor(position[1])))
+            x = position[0] - 0.5  # pixel centres are at half-integers
+            y = position[1] - 0.5
             x0 = int(wp.floor(x))
             y0 = int(wp.floor(y))
             fx = x - wp.floor(x)
@@ -144,6 +179,40 @@ def make_eval_texture(kinds: tuple[str, ...]):
         return wp.vec3(1.0)
 
     return eval_texture if kinds else no_texture
+
+
+@functools.cache
+def make_eval_gradient(kinds: tuple[str, ...]):
+    """`eval_gradient(tables, texture, uv) -> vec2`: derivatives of a bilinear bitmap's luminance by u and v of the
+    surface, which jump from one cell between pixel centres to the next.
+
+    Args:
+        kinds: As for `make_eval_texture`; a checkerboard has none.
+    """
+    fetch = make_fetch(kinds)
+
+    @wp.func
+    def eval_gradient(tables: TextureTables, texture: int, surface_uv: wp.vec2) -> wp.vec2:
+        record = tables.records[texture]
+        uv = texture_uv(record, surface_uv)
+        if record.kind == KIND_CHECKERBOARD or not wp.isfinite(uv[0] + uv[1]):
+            return wp.vec2(0.0)
+        position = pixel_position(record, uv) - wp.vec2(0.5)
+        x = int(wp.floor(position[0]))
+        y = int(wp.floor(position[1]))
+        fx = position[0] - wp.floor(position[0])
+        fy = position[1] - wp.floor(position[1])
+        v00 = luminance(fetch(tables, record, x, y))
+        v10 = luminance(fetch(tables, record, x + 1, y))
+        v01 = luminance(fetch(tables, record, x, y + 1))
+        v11 = luminance(fetch(tables, record, x + 1, y + 1))
+        by_u = float(record.width) * wp.lerp(v10 - v00, v11 - v01, fy)
+        by_v = float(record.height) * wp.lerp(v01 - v00, v11 - v10, fx)
+        return wp.vec2(
+            by_u * record.uv_row0[0] + by_v * record.uv_row1[0], by_u * record.uv_row0[1] + by_v * record.uv_row1[1]
+        )
+
+    return eval_gradient
 
 
 @functools.cache

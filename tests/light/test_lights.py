@@ -22,7 +22,7 @@ N = 100_000
 ULP = 2.0**-24
 
 closest_hit, occluded = make_intersector(True, True)
-vertex_of = make_vertex(True, True, True, False, False)
+vertex_of = make_vertex(True, True, True, False, False, False)
 sample_light, light_pdf = make_light_sampler(("constant", "sphere", "triangle"), ())
 
 

@@ -16,7 +16,10 @@ from wavefront.scene.validate import MESH_SUFFIXES, validate
 STEP = d.TransformStep
 TILES = str(Path(__file__).parents[2] / "scenes" / "textures" / "tiles.png")
 STEPS = "translate, rotate, scale, look_at, matrix"
-REFLECTING = "diffuse, oren_nayar, conductor, rough_conductor, plastic, rough_plastic, principled"
+REFLECTING = (
+    "diffuse, oren_nayar, conductor, rough_conductor, plastic, rough_plastic, principled, a blend of those, and a "
+    "normal_map or bump_map around one"
+)
 TOO_LARGE = "expected a number of at most 3.403e+38, as 32-bit floats are; found"
 
 
@@ -66,7 +69,7 @@ def moved(*transform, shape=d.Rectangle):
         ),
         (
             with_bsdfs(d.TwoSided(front=d.Diffuse(), back=d.Principled(spec_trans=0.1))),
-            "bsdfs[0].back: a principled BSDF that transmits is on both sides already; spec_trans must be 0",
+            "bsdfs[0].back: a twosided BSDF cannot hold principled with spec_trans; allowed: " + REFLECTING,
         ),
         (
             with_bsdfs(d.Principled(eta=1.5, specular=0.5)),

@@ -49,7 +49,7 @@ def direct(n, slots=None, wo=WO, beta=BETA, material=0, capacity=None, radiance=
         diffuse=[{"reflectance": REFLECTANCE}],
         conductor=[{"eta": 0.0, "k": 1.0, "reflectance": 1.0}],
     )
-    kernel = make_direct(("conductor", "diffuse"), False, (), ("constant", "triangle"), (), False, False)
+    kernel = make_direct(("conductor", "diffuse"), False, (), ("constant", "triangle"), (), False, False, ())
     arguments = [scene.geometry, table, no_textures(), tables, p, s, hits, wp.uint64(SEED)]
     launch(kernel, n, *arguments, rays, shadow, counters.array)
     return rays, counters

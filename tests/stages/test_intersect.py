@@ -43,7 +43,14 @@ def trace(
     capacity=16,
     **flags,
 ):
-    features = {"smooth": True, "uvs": True, "tangents": True, "area_lights": True, "escape_lights": True} | flags
+    features = {
+        "smooth": True,
+        "uvs": True,
+        "tangents": True,
+        "bumps": True,
+        "area_lights": True,
+        "escape_lights": True,
+    } | flags
     scene = Scene([NEAR, BACK], [SPHERE], normals, UVS, shapes)
     scene.geometry.sphere_to_local = array(np.eye(3, dtype=np.float32)[None], wp.mat33)
     n = len(directions)
@@ -126,7 +133,7 @@ def test_normal_follows_vertex_normals():
 
 
 def test_features_that_are_off_are_not_written():
-    s, counters = trace(smooth=False, uvs=False, tangents=False, area_lights=False, escape_lights=False)
+    s, counters = trace(smooth=False, uvs=False, tangents=False, bumps=False, area_lights=False, escape_lights=False)
     assert counters.content("escaped") == []
     assert counters.content("emissive") == []
     assert (s.light.numpy() == 99).all()

@@ -31,7 +31,9 @@ def scatter(n, material, depth=0, rr_depth=None, beta=1.0, eta=1.0, wo=WO, slots
         conductor=[{"eta": 0.0, "k": 1.0, "reflectance": (0.9, 0.8, 0.7)}],
         dielectric=[{"eta": ETA, "reflectance": 1.0, "transmittance": 1.0}],
     )
-    kernel = make_scatter(("conductor", "dielectric", "diffuse"), False, (), False, False, True, rr_depth is not None)
+    kernel = make_scatter(
+        ("conductor", "dielectric", "diffuse"), False, (), False, False, (), True, rr_depth is not None
+    )
     launch(kernel, n, table, no_textures(), s, hits, rr_depth or 0, wp.uint64(SEED), p, rays, counters.array)
     return p, counters
 

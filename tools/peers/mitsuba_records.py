@@ -145,6 +145,21 @@ class _Writer:
         if isinstance(bsdf, description.TwoSided):
             front = self._bsdf(bsdf.front)
             return {"type": "twosided", "front": front, "back": front if bsdf.back is None else self._bsdf(bsdf.back)}
+        if isinstance(bsdf, description.Blend):
+            weight = self._parameter(bsdf.weight, scalar=True)
+            return {
+                "type": "blendbsdf",
+                "weight": weight,
+                "bsdf_0": self._bsdf(bsdf.first),
+                "bsdf_1": self._bsdf(bsdf.second),
+            }
+        if isinstance(bsdf, (description.NormalMap, description.BumpMap)):
+            result = {"flip_invalid_normals": bsdf.flip_invalid_normals, "use_shadowing_function": bsdf.shadowing}
+            result["nested"] = self._bsdf(bsdf.bsdf)
+            if isinstance(bsdf, description.NormalMap):
+                return result | {"type": "normalmap", "normalmap": self._parameter(bsdf.normal, scalar=True)}
+            height = self._parameter(bsdf.height, scalar=True)
+            return result | {"type": "bumpmap", "height": height, "scale": bsdf.scale}
         if isinstance(bsdf, description.Mask):
             opacity = self._parameter(bsdf.opacity, scalar=True)
             return {"type": "mask", "opacity": opacity, "nested": self._bsdf(bsdf.bsdf)}

@@ -23,6 +23,7 @@ class Shape:
     smooth: wp.int32  # 1: has vertex normals
     flip: wp.int32  # 1: a sphere that faces inwards
     two_sided: wp.int32  # 1: the back emits too
+    polar: wp.int32  # 1: u is the distance from the centre of a disk, v the angle
 
 
 @wp.struct

@@ -6,10 +6,12 @@ import functools
 
 import warp as wp
 
-from wavefront.bsdf.frame import ShadingFrame, make_frame
-from wavefront.bsdf.kinds import make_eval_scalar, make_kinds
-from wavefront.bsdf.record import BsdfEval, BsdfSample
+from wavefront.bsdf.blend import make_blend
+from wavefront.bsdf.frame import ShadingFrame, base_shadowing, make_frame
+from wavefront.bsdf.kinds import make_eval_scalar
+from wavefront.bsdf.record import BsdfEval, BsdfSample, no_eval
 from wavefront.bsdf.tables import (
+    KIND_BLEND_TRANSMISSIVE,
     KIND_CONDUCTOR,
     KIND_DIELECTRIC,
     KIND_NONE,
@@ -31,7 +33,12 @@ def is_delta_transmission(kind: int) -> bool:
 
 @wp.func
 def transmits(kind: int) -> bool:
-    return is_delta_transmission(kind) or kind == KIND_ROUGH_DIELECTRIC or kind == KIND_PRINCIPLED_TRANSMISSIVE
+    return (
+        is_delta_transmission(kind)
+        or kind == KIND_ROUGH_DIELECTRIC
+        or kind == KIND_PRINCIPLED_TRANSMISSIVE
+        or kind == KIND_BLEND_TRANSMISSIVE
+    )
 
 
 @wp.func
@@ -47,7 +54,7 @@ def is_smooth(material: Material, cos_o: float) -> bool:
 
 
 @functools.cache
-def make_bsdf(kinds: tuple[str, ...], mask: bool, textures: tuple[str, ...], tangents: bool):
+def make_bsdf(kinds: tuple[str, ...], mask: bool, textures: tuple[str, ...], tangents: bool, maps: bool):
     """BSDF functions for the kinds in a scene.
 
     Args:
@@ -55,15 +62,16 @@ def make_bsdf(kinds: tuple[str, ...], mask: bool, textures: tuple[str, ...], tan
         mask: Whether some material is not opaque.
         textures: Kinds of texture that parameters may have, see `texture.make_eval_texture`.
         tangents: Whether frames have a tangent.
+        maps: Whether some material has a bump or normal map.
 
     Returns:
         `eval_bsdf(tables, textures, material, uv, frame, wo, wi) -> BsdfEval` without the delta parts,
         `sample_bsdf(tables, textures, material, uv, frame, wo, u) -> BsdfSample`, both with directions in world
         space, and `eval_albedo(tables, textures, material, uv, normal, wo) -> vec3`, a colour for denoisers.
     """
-    eval_local, sample_local, albedo_local = make_kinds(kinds, textures)
+    eval_local, sample_local, albedo_local = make_blend(kinds, textures)
     eval_scalar = make_eval_scalar(textures)
-    _, basis = make_frame(tangents)
+    _, basis = make_frame(tangents, maps)
 
     @wp.func
     def opacity_at(textures: TextureTables, material: Material, uv: wp.vec2) -> float:
@@ -101,6 +109,11 @@ def make_bsdf(kinds: tuple[str, ...], mask: bool, textures: tuple[str, ...], tan
             mirror_side(kind, wo_local, cos_o),
             mirror_side(kind, to_local(s, t, frame.normal, wi), cos_o),
         )
+        if wp.static(maps):
+            shadowing = base_shadowing(frame, wi)
+            if shadowing == 0.0:
+                return no_eval()
+            result.value *= shadowing
         if wp.static(mask):
             opacity = opacity_at(textures, material, uv)
             result.value *= opacity
@@ -137,6 +150,8 @@ def make_bsdf(kinds: tuple[str, ...], mask: bool, textures: tuple[str, ...], tan
             tables, textures, kind, index, uv, mirror_side(kind, wo_local, cos_o), wp.vec3(u[0], u[1], u_lobe)
         )
         result.wi = to_world(s, t, frame.normal, mirror_side(kind, result.wi, cos_o))
+        if wp.static(maps):
+            result.weight *= base_shadowing(frame, result.wi)
         if wp.static(mask):
             result.pdf *= opacity
         return result

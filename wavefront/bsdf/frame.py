@@ -1,4 +1,7 @@
-"""The frame that a BSDF is evaluated in: the shading normal and, where a scene needs one, a tangent."""
+"""The frame that a BSDF is evaluated in: the shading normal and, where a scene needs one, a tangent.
+
+A bump or normal map turns the frame. What was the shading normal before is then the base normal.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +22,17 @@ class ShadingFrame:
 
     normal: wp.vec3
     tangent: wp.vec3  # unit length, orthogonal to the normal
+    base_normal: wp.vec3  # set where a scene has maps, as is
+    terminator: float  # alpha^2 of `base_shadowing`; -1: nothing is reflected
 
 
 @functools.cache
-def make_frame(tangents: bool):
+def make_frame(tangents: bool, maps: bool):
     """Functions of frames.
 
     Args:
         tangents: Field of `Features`.
+        maps: Whether some material has a bump or normal map.
 
     Returns:
         `frame_at(surfaces, slot) -> ShadingFrame` and `basis(frame) -> (s, t)`.
@@ -38,6 +44,9 @@ def make_frame(tangents: bool):
         frame.normal = surfaces.shading_normal[slot]
         if wp.static(tangents):
             frame.tangent = surfaces.tangent[slot]
+        if wp.static(maps):
+            frame.base_normal = surfaces.base_normal[slot]
+            frame.terminator = surfaces.terminator[slot]
         return frame
 
     @wp.func
@@ -50,3 +59,24 @@ def make_frame(tangents: bool):
         return s, t
 
     return frame_at, tangent_basis if tangents else any_basis
+
+
+@wp.func
+def terminator_alpha2(n: wp.vec3) -> float:
+    """Squared roughness of the surface that a mapped normal (unit length, base normal z) is taken as a sample of."""
+    return wp.min(0.125 * (n[0] * n[0] + n[1] * n[1]) / (n[2] * n[2]), 1.0)
+
+
+@wp.func
+def base_shadowing(frame: ShadingFrame, wi: wp.vec3) -> float:
+    """Factor of a BSDF whose frame was turned by a map: GGX masking of `wi` above the base surface, so that light does
+    not end at a sharp line where it falls below the turned surface (Conty Estevez, Lecocq and Stein 2019, Ray Tracing
+    Gems, chapter 12); zero where `wi` is above one of the two surfaces and below the other.
+    """
+    z = wp.dot(frame.base_normal, wi)
+    if z * wp.dot(frame.normal, wi) <= 0.0 or frame.terminator < 0.0:
+        return 0.0
+    if frame.terminator == 0.0:
+        return 1.0
+    z2 = z * z
+    return 2.0 / (1.0 + wp.sqrt(1.0 + frame.terminator * wp.max(1.0 - z2, 0.0) / z2))

@@ -35,7 +35,7 @@ from wavefront.bsdf.tables import (
     PrincipledRecord,
 )
 from wavefront.bsdf.thin_dielectric import sample_thin_dielectric
-from wavefront.texture import TextureTables, make_eval_parameter
+from wavefront.texture import TextureTables, luminance, make_eval_parameter, make_eval_texture
 
 MIN_ALPHA = wp.constant(1.0e-4)  # below, a microfacet lobe is too narrow for float32
 
@@ -48,13 +48,16 @@ def clamp_alpha(alpha: float) -> float:
 
 @functools.cache
 def make_eval_scalar(textures: tuple[str, ...]):
-    """`eval_scalar(tables, value, texture, uv) -> float`: a parameter that is a number."""
-    eval_parameter = make_eval_parameter(textures)
+    """`eval_scalar(tables, value, texture, uv) -> float`: a parameter that is a number; of a colour, the luminance."""
+    textured = bool(textures)
+    eval_texture = make_eval_texture(textures)
 
     @wp.func
-    def eval_scalar(textures: TextureTables, value: float, texture: int, uv: wp.vec2) -> float:
-        v = eval_parameter(textures, wp.vec3(value), texture, uv)
-        return (v[0] + v[1] + v[2]) / 3.0
+    def eval_scalar(tables: TextureTables, value: float, texture: int, uv: wp.vec2) -> float:
+        if wp.static(textured):
+            if texture >= 0:
+                return luminance(eval_texture(tables, texture, uv))
+        return value
 
     return eval_scalar
 

@@ -21,6 +21,8 @@ KIND_NULL = wp.constant(9)
 KIND_OREN_NAYAR = wp.constant(10)
 KIND_PRINCIPLED = wp.constant(11)
 KIND_PRINCIPLED_TRANSMISSIVE = wp.constant(12)
+KIND_BLEND = wp.constant(20)  # of BSDFs that reflect
+KIND_BLEND_TRANSMISSIVE = wp.constant(21)  # of BSDFs of which one transmits
 KINDS = {
     "diffuse": 1,
     "conductor": 2,
@@ -34,8 +36,18 @@ KINDS = {
     "oren_nayar": 10,
     "principled": 11,
     "principled_transmissive": 12,
+    "blend": 20,
+    "blend_transmissive": 21,
 }
-TRANSMISSIVE = ("dielectric", "rough_dielectric", "thin_dielectric", "null", "principled_transmissive")
+TRANSMISSIVE = (
+    "dielectric",
+    "rough_dielectric",
+    "thin_dielectric",
+    "null",
+    "principled_transmissive",
+    "blend_transmissive",
+)
+BLENDS = ("blend", "blend_transmissive")
 DELTA = ("conductor", "dielectric", "thin_dielectric", "null")
 
 
@@ -141,8 +153,63 @@ class PrincipledRecord:
 
 
 @wp.struct
+class BlendRecord:
+    """A mixture; a blend of blends is flattened."""
+
+    first: wp.int32  # index into MaterialTables.blend_parts
+    count: wp.int32
+
+
+@wp.struct
+class BlendPart:
+    """A BSDF of a mixture, and which factors make its weight."""
+
+    kind: wp.int32
+    index: wp.int32
+    first: wp.int32  # index into MaterialTables.blend_factors
+    count: wp.int32
+
+
+@wp.struct
+class BlendFactor:
+    weight: wp.float32
+    weight_texture: wp.int32
+    complement: wp.int32  # 1: the factor is 1 - weight
+
+
+MAP_NORMAL = wp.constant(0)
+MAP_BUMP = wp.constant(1)
+MAPS = {"normal": 0, "bump": 1}
+
+
+@wp.struct
+class MapRecord:
+    """A normal map (`normal`, or a texture, of the normal's coordinates in [0, 1]) or a bump map (a texture of the
+    height, times `scale`)."""
+
+    kind: wp.int32
+    normal: wp.vec3
+    texture: wp.int32
+    scale: wp.float32
+    flip: wp.int32  # 1: turn a normal that faces away from the viewer
+    shadowing: wp.int32  # 1: see `frame.base_shadowing`
+
+
+@wp.struct
+class MaterialMaps:
+    front: wp.int32  # index into MaterialTables.maps; -1: none
+    back: wp.int32
+    mirrored: wp.int32  # 1: the map of the back is inside a two-sided BSDF, hence belongs to its mirror image
+
+
+@wp.struct
 class MaterialTables:
     materials: wp.array[Material]
+    maps_of: wp.array[MaterialMaps]  # per material; empty if none has a map
+    maps: wp.array[MapRecord]
+    blend: wp.array[BlendRecord]
+    blend_parts: wp.array[BlendPart]
+    blend_factors: wp.array[BlendFactor]
     diffuse: wp.array[DiffuseRecord]
     conductor: wp.array[ConductorRecord]
     dielectric: wp.array[DielectricRecord]

@@ -286,6 +286,46 @@ class Mask(Record, tag_field="type", tag="mask"):
     opacity: Opacity = 0.5
 
 
+class NormalMap(Record, tag_field="type", tag="normal_map"):
+    """Turns the shading frame by normals from an image; goes around what is to be shaded so."""
+
+    bsdf: Annotated[str | Bsdf, Meta(description="Name of a BSDF, or a BSDF; no mask, null or other map.")]
+    normal: Annotated[
+        RGBFraction | str | Bitmap | Checkerboard,
+        Meta(description="(x, y, z) of the normal scaled to [0, 1]; x is along growing u. 8-bit images are linear."),
+    ]
+    name: str = ""
+    flip_invalid_normals: Annotated[
+        bool, Meta(description="Turn a normal that faces away from the viewer about the base normal.")
+    ] = True
+    shadowing: Annotated[bool, Meta(description="Darken light from near the horizon of the base surface.")] = True
+
+
+class BumpMap(Record, tag_field="type", tag="bump_map"):
+    """Turns the shading frame by the slope of a height field; goes around what is to be shaded so."""
+
+    bsdf: Annotated[str | Bsdf, Meta(description="Name of a BSDF, or a BSDF; no mask, null or other map.")]
+    height: Annotated[
+        str | Bitmap,
+        Meta(description="Bilinear image of the height along the normal, metres. 8-bit images are linear."),
+    ]
+    name: str = ""
+    scale: Annotated[float, Meta(description="Multiplies the height.")] = 1.0
+    flip_invalid_normals: Annotated[
+        bool, Meta(description="Turn a normal that faces away from the viewer about the base normal.")
+    ] = True
+    shadowing: Annotated[bool, Meta(description="Darken light from near the horizon of the base surface.")] = True
+
+
+class Blend(Record, tag_field="type", tag="blend"):
+    """A mixture of two BSDFs, (1 - weight) first + weight second, each of which may be a blend."""
+
+    first: Annotated[str | Bsdf, Meta(description="Name of a BSDF, or a BSDF; no mask, twosided or map.")]
+    second: Annotated[str | Bsdf, Meta(description="Name of a BSDF, or a BSDF; no mask, twosided or map.")]
+    name: str = ""
+    weight: Annotated[Opacity, Meta(description="Of the second.")] = 0.5
+
+
 Bsdf = (
     Diffuse
     | OrenNayar
@@ -298,6 +338,9 @@ Bsdf = (
     | RoughPlastic
     | Principled
     | Null
+    | Blend
+    | NormalMap
+    | BumpMap
     | TwoSided
     | Mask
 )

@@ -36,6 +36,7 @@ class DeviceScene:
     bsdfs: tuple[str, ...]
     mask: bool
     tangents: bool
+    maps: tuple[str, ...]
     texture_kinds: tuple[str, ...]
     light_kinds: tuple[str, ...]
     light_texture_kinds: tuple[str, ...]
@@ -82,6 +83,7 @@ class _Upload:
             bsdfs=tuple(sorted(self.materials.kinds)),
             mask=self.materials.mask,
             tangents=self.materials.tangents,
+            maps=tuple(sorted(self.materials.map_kinds)),
             texture_kinds=tuple(sorted(set(self.atlas.kinds))),
             light_kinds=light_kinds,
             light_texture_kinds=tuple(sorted(self.light_texture_kinds)),
@@ -110,6 +112,7 @@ class _Upload:
                 if mesh.dropped:
                     self.notes.append(f"{where}: {mesh.dropped} triangles without area are left out")
                 record["smooth"] = int(mesh.normals is not None)
+                record["polar"] = int(isinstance(shape, description.Disk))
                 meshes.append((record, mesh, emitter))
         clear_cache()
         return meshes, spheres

@@ -34,13 +34,16 @@ TEXTURE_FIELDS = frozenset(
         "base_color",
         *PRINCIPLED_FRACTIONS,
         "opacity",
+        "weight",
+        "normal",
+        "height",
         "radiance",
         "eta",
         "k",
     )
 )
 # Fields in which a string is the name of a BSDF.
-BSDF_FIELDS = frozenset(("bsdf", "front", "back"))
+BSDF_FIELDS = frozenset(("bsdf", "front", "back", "first", "second"))
 # Long lists of numbers, in which there is no record to find.
 NUMBER_FIELDS = frozenset(("vertices", "faces", "normals", "uvs"))
 _LISTED = 24  # names that a message lists at most

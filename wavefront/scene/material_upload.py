@@ -28,6 +28,9 @@ BSDF_KINDS = {
 }
 
 
+TRANSMISSIVE = {bsdf_tables.KINDS[kind] for kind in bsdf_tables.TRANSMISSIVE}
+
+
 def bsdf_kind(bsdf: description.Bsdf) -> str:
     """Name of the kind, from `tables.KINDS`, of a BSDF that is neither two-sided nor a mask."""
     if isinstance(bsdf, description.Principled) and bsdf.spec_trans != 0.0:  # a number, or textured
@@ -53,6 +56,28 @@ def _relative_ior(bsdf) -> float:
     return interior / exterior
 
 
+class BlendTables:
+    """Collects mixtures, flattened."""
+
+    def __init__(self):
+        self.blends: list[dict] = []
+        self.parts: list[dict] = []
+        self.factors: list[dict] = []
+
+    def add(self, parts: list[tuple[int, int, tuple[dict, ...]]]) -> int:
+        """Index of a mixture, from kind, record index and factors of the weight of each part."""
+        self.blends.append({"first": len(self.parts), "count": len(parts)})
+        for kind, index, factors in parts:
+            self.parts.append({"kind": kind, "index": index, "first": len(self.factors), "count": len(factors)})
+            self.factors += factors
+        return len(self.blends) - 1
+
+    def upload(self, materials: bsdf_tables.MaterialTables, device: str) -> None:
+        materials.blend = struct_array(bsdf_tables.BlendRecord, self.blends, device)
+        materials.blend_parts = struct_array(bsdf_tables.BlendPart, self.parts, device)
+        materials.blend_factors = struct_array(bsdf_tables.BlendFactor, self.factors, device)
+
+
 class MaterialUpload:
     """Collects materials, each once.
 
@@ -76,13 +101,20 @@ class MaterialUpload:
         self.kinds: set[str] = set()
         self.known: dict[int, int] = {}
         self.mask = False
-        self.tangents = False  # whether some BSDF depends on the direction of its tangent
+        self.blends = BlendTables()
+        self.tangents = False  # whether some BSDF or map depends on the direction of the tangent
+        self.maps: list[dict] = []
+        self.maps_of: list[dict] = []
+        self.map_kinds: set[str] = set()
         self.keep_alive: list = []
 
     def upload(self, device: str) -> bsdf_tables.MaterialTables:
         """The tables with all that was added."""
         materials = bsdf_tables.MaterialTables()
         materials.materials = struct_array(bsdf_tables.Material, self.materials, device)
+        materials.maps = struct_array(bsdf_tables.MapRecord, self.maps, device)
+        materials.maps_of = struct_array(bsdf_tables.MaterialMaps, self.maps_of if self.maps else [], device)
+        self.blends.upload(materials, device)
         materials.diffuse = struct_array(bsdf_tables.DiffuseRecord, self.bsdfs["diffuse"], device)
         materials.conductor = struct_array(bsdf_tables.ConductorRecord, self.bsdfs["conductor"], device)
         materials.dielectric = struct_array(bsdf_tables.DielectricRecord, self.bsdfs["dielectric"], device)
@@ -115,23 +147,67 @@ class MaterialUpload:
             self._set(material, "opacity", inner.opacity, f"{where}.opacity", scalar=True)
             self.mask = True
             inner, where = resolve_bsdf(self.scene, inner.bsdf), f"{where}.bsdf"
+        inner, where, outer = self._without_map(inner, where)
         if isinstance(inner, description.TwoSided):
             front = resolve_bsdf(self.scene, inner.front)
             back = front if inner.back is None else resolve_bsdf(self.scene, inner.back)
-            sides = [self._bsdf(front, f"{where}.front")]
-            sides.append(sides[0] if back is front else self._bsdf(back, f"{where}.back"))
+            sides = [self._side(front, f"{where}.front")]
+            sides.append(sides[0] if back is front else self._side(back, f"{where}.back"))
         else:
-            front = self._bsdf(inner, where)
-            transmits = bsdf_kind(inner) in bsdf_tables.TRANSMISSIVE
-            sides = [front, front if transmits else (int(bsdf_tables.KIND_NONE), 0)]
-        (material["front"], material["front_index"]), (material["back"], material["back_index"]) = sides
+            kind, index = self._bsdf(inner, where)
+            sides = [(kind, index, -1), (kind if kind in TRANSMISSIVE else int(bsdf_tables.KIND_NONE), index, -1)]
+        for side, (kind, index, _) in zip(("front", "back"), sides, strict=True):
+            material[side], material[f"{side}_index"] = kind, index
+        front, back = (inside if outer < 0 else outer for *_, inside in sides)
+        self.maps_of.append({"front": front, "back": back, "mirrored": int(outer < 0)})
         self.materials.append(material)
         self.known[id(bsdf)] = len(self.materials) - 1
         self.keep_alive.append(bsdf)  # the id stays taken
         return len(self.materials) - 1
 
+    def _side(self, bsdf: description.Bsdf, where: str) -> tuple[int, int, int]:
+        """Kind, record index and map of one side of a two-sided BSDF."""
+        inner, where, index = self._without_map(bsdf, where)
+        return *self._bsdf(inner, where), index
+
+    def _without_map(self, bsdf: description.Bsdf, where: str) -> tuple[description.Bsdf, str, int]:
+        """What a map is around, its record path, and the index of the map (-1: there is none)."""
+        if not isinstance(bsdf, (description.NormalMap, description.BumpMap)):
+            return bsdf, where, -1
+        kind = "bump" if isinstance(bsdf, description.BumpMap) else "normal"
+        field = "height" if kind == "bump" else "normal"
+        value, texture = self.atlas.parameter(self.scene, getattr(bsdf, field), f"{where}.{field}", scalar=True)
+        record = {"kind": bsdf_tables.MAPS[kind], "texture": texture, "scale": getattr(bsdf, "scale", 1.0)}
+        record |= {"normal": value, "flip": int(bsdf.flip_invalid_normals), "shadowing": int(bsdf.shadowing)}
+        self.maps.append(record)
+        self.map_kinds.add(kind)
+        self.tangents = True
+        return resolve_bsdf(self.scene, bsdf.bsdf), f"{where}.bsdf", len(self.maps) - 1
+
+    def _blend(self, blend: description.Blend, where: str) -> tuple[int, int]:
+        parts = []
+        for bsdf, place, factors in self._parts(blend, where, ()):
+            kind, index = self._bsdf(bsdf, place)
+            parts.append((kind, index, factors))
+        kind = "blend_transmissive" if any(kind in TRANSMISSIVE for kind, *_ in parts) else "blend"
+        self.kinds.add(kind)
+        return bsdf_tables.KINDS[kind], self.blends.add(parts)
+
+    def _parts(self, bsdf: description.Bsdf, where: str, factors: tuple):
+        """The BSDFs that a blend of blends mixes: record, path, and the factors of its weight."""
+        if not isinstance(bsdf, description.Blend):
+            yield bsdf, where, factors
+            return
+        weight, texture = self.atlas.parameter(self.scene, bsdf.weight, f"{where}.weight", scalar=True)
+        for complement, field in ((1, "first"), (0, "second")):
+            factor = {"weight": weight, "weight_texture": texture, "complement": complement}
+            nested = resolve_bsdf(self.scene, getattr(bsdf, field))
+            yield from self._parts(nested, f"{where}.{field}", (*factors, factor))
+
     def _bsdf(self, bsdf: description.Bsdf, where: str) -> tuple[int, int]:
-        """Kind and record index of a BSDF that is neither two-sided nor a mask."""
+        """Kind and record index of a BSDF that is neither two-sided nor a mask nor a map."""
+        if isinstance(bsdf, description.Blend):
+            return self._blend(bsdf, where)
         kind = bsdf_kind(bsdf)
         self.kinds.add(kind)
         if kind == "null":

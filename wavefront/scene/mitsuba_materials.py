@@ -49,6 +49,9 @@ class Materials:
             "principled": self._principled,
             "twosided": self._twosided,
             "mask": self._mask,
+            "blendbsdf": self._blend,
+            "normalmap": self._normal_map,
+            "bumpmap": self._bump_map,
             "null": self._null,
         }
 
@@ -87,8 +90,7 @@ class Materials:
 
     def _convert_bsdf(self, plugin):
         if plugin.type not in self._bsdfs:
-            yet = " yet" if plugin.type in ("bumpmap", "normalmap") else ""
-            raise plugin.error(f"{plugin.label()} is not supported{yet}; supported: {', '.join(self._bsdfs)}")
+            raise plugin.error(f"{plugin.label()} is not supported; supported: {', '.join(self._bsdfs)}")
         return self._bsdfs[plugin.type](plugin)
 
     def _diffuse(self, plugin):
@@ -244,6 +246,47 @@ class Materials:
         if len(nested) != 1:
             raise plugin.error(f"{plugin.label()} needs one BSDF; found {len(nested)}")
         return description.Mask(opacity=opacity, bsdf=self.bsdf(nested[0]))
+
+    def _blend(self, plugin):
+        weight = self.scalar(plugin, "weight", None, limit=1.0)
+        nested = plugin.objects("bsdf")
+        plugin.finish("bsdf", "texture")
+        if len(nested) != 2:
+            raise plugin.error(f"{plugin.label()} needs two BSDFs; found {len(nested)}")
+        if weight is None:
+            raise plugin.error(f"{plugin.label()} needs a weight")
+        return description.Blend(first=self.bsdf(nested[0]), second=self.bsdf(nested[1]), weight=weight)
+
+    def _map_fields(self, plugin):
+        fields = {
+            "flip_invalid_normals": plugin.boolean("flip_invalid_normals", True),
+            "shadowing": plugin.boolean("use_shadowing_function", True),
+        }
+        nested = plugin.objects("bsdf")
+        plugin.finish("bsdf", "texture")
+        if len(nested) != 1:
+            raise plugin.error(f"{plugin.label()} needs one BSDF; found {len(nested)}")
+        return fields | {"bsdf": self.bsdf(nested[0])}
+
+    def _normal_map(self, plugin):
+        texture = plugin.child("normalmap")
+        normal = self.colour(plugin, "normalmap", None, 1.0) if texture is None else self._texture(texture, True, 1.0)
+        if normal is None:
+            raise plugin.error(f"{plugin.label()} needs a normalmap")
+        normal = [normal] * 3 if isinstance(normal, float) else normal
+        return description.NormalMap(normal=normal, **self._map_fields(plugin))
+
+    def _bump_map(self, plugin):
+        """Its texture may have any name."""
+        textures = plugin.objects("texture")
+        scale = plugin.number("scale", 1.0)
+        fields = self._map_fields(plugin)
+        if len(textures) != 1:
+            raise plugin.error(f"{plugin.label()} needs one texture; found {len(textures)}")
+        height = self._texture(textures[0], True, None)
+        if not isinstance(height, description.Bitmap):
+            raise plugin.error(f"{plugin.label()} needs a bitmap")
+        return description.BumpMap(height=height, scale=scale, **fields)
 
     def _null(self, plugin):
         plugin.finish()

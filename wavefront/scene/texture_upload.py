@@ -42,7 +42,7 @@ class TextureAtlas:
         value = resolve_texture(scene, value)
         if isinstance(value, (description.Bitmap, description.Checkerboard)):
             return (1.0 if scalar else np.ones(3)), self.add(value, where, scalar)
-        return (float(value) if scalar else rgb(value)), -1
+        return (float(value) if scalar and np.ndim(value) == 0 else rgb(value)), -1
 
     def add(self, texture: description.Texture, where: str, scalar: bool) -> int:
         """Index of a texture; `scalar` textures hold numbers, not colours, unless they say otherwise."""

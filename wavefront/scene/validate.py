@@ -17,6 +17,14 @@ from wavefront.scene.transforms import to_matrix
 MESH_SUFFIXES = (".ply", ".obj", ".gltf", ".glb")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".hdr")
 _REFLECTING = ("diffuse", "oren_nayar", "conductor", "rough_conductor", "plastic", "rough_plastic", "principled")
+_MAPS = ("normal_map", "bump_map")
+_HOLDERS = (
+    description.TwoSided,
+    description.Mask,
+    description.NormalMap,
+    description.BumpMap,
+    description.Blend,
+)
 _LARGEST = float(np.finfo(np.float32).max)
 
 
@@ -47,8 +55,10 @@ def validate(
                 _check_principled(record, path)
             elif isinstance(record, description.Mesh):
                 _check_mesh(record, path)
-            elif isinstance(record, (description.TwoSided, description.Mask)):
+            elif isinstance(record, _HOLDERS):
                 _check_nesting(record, path, bsdfs)
+                if isinstance(record, description.BumpMap):
+                    _check_height(record, path, scene)
         for i, shape in enumerate(scene.shapes):
             matrix = _check_transform(shape.to_world, f"shapes[{i}].to_world")
             if isinstance(shape, description.Sphere) and matrix is not None and not _is_similarity(matrix):
@@ -143,21 +153,82 @@ def _check_principled(bsdf, path):
 
 
 def _check_nesting(bsdf, path, bsdfs):
-    """A two-sided BSDF holds reflecting ones; a mask holds anything but a mask. So nesting ends by itself."""
-    for field in ("front", "back") if isinstance(bsdf, description.TwoSided) else ("bsdf",):
-        inner = getattr(bsdf, field)
+    """From the outside to the inside: mask, map, twosided, map, blends, what scatters; a surface has one map at most.
+
+    So nesting ends by itself.
+    """
+    for field in sorted(BSDF_FIELDS.intersection(bsdf.__struct_fields__)):
+        inner, place = getattr(bsdf, field), f"{path}.{field}"
         if isinstance(inner, str):
-            _check_cycle(inner, f"{path}.{field}", bsdfs)
+            _check_cycle(inner, place, bsdfs)
             inner = bsdfs.get(inner)  # an unknown name is reported where the reference is checked
         if inner is None:
             continue
-        kind = inner.__struct_config__.tag
-        if isinstance(bsdf, description.TwoSided) and kind not in _REFLECTING:
-            _fail(f"{path}.{field}", f"a twosided BSDF cannot hold {kind}; allowed: {', '.join(_REFLECTING)}")
-        if isinstance(bsdf, description.TwoSided) and kind == "principled" and inner.spec_trans != 0.0:
-            _fail(f"{path}.{field}", "a principled BSDF that transmits is on both sides already; spec_trans must be 0")
-        if isinstance(bsdf, description.Mask) and kind == "mask":
-            _fail(f"{path}.{field}", "a mask cannot hold another mask; multiply their opacities")
+        kind = _kind(inner)
+        if isinstance(bsdf, description.TwoSided):
+            _check_side(kind, inner, place, bsdfs)
+        elif isinstance(bsdf, description.Mask) and kind == "mask":
+            _fail(place, "a mask cannot hold another mask; multiply their opacities")
+        elif isinstance(bsdf, description.Blend) and kind in (*_MAPS, "mask", "twosided"):
+            _fail(place, f"a blend cannot hold {kind}; put the {kind} around the blend")
+        elif isinstance(bsdf, (description.NormalMap, description.BumpMap)):
+            _check_map(bsdf.__struct_config__.tag, kind, inner, place, bsdfs)
+
+
+def _check_side(kind, inner, path, bsdfs):
+    """A side of a two-sided BSDF reflects."""
+    if kind in _MAPS:
+        inner = _resolved(inner.bsdf, bsdfs)
+        kind, path = (_kind(inner) if inner is not None else "diffuse"), f"{path}.bsdf"
+    allowed = f"allowed: {', '.join(_REFLECTING)}, a blend of those, and a normal_map or bump_map around one"
+    if kind == "blend":
+        for part in _blended(inner, bsdfs):
+            if part not in (*_REFLECTING, *_MAPS, "mask", "twosided"):  # of which a blend says itself
+                _fail(path, f"a twosided BSDF cannot hold a blend with {part}; {allowed}")
+    elif kind not in _REFLECTING:
+        _fail(path, f"a twosided BSDF cannot hold {kind}; {allowed}")
+
+
+def _check_map(holder, kind, inner, path, bsdfs):
+    if kind in (*_MAPS, "mask", "null"):
+        hint = {"mask": f"; put the {holder} into the mask", "null": ", which has no normal"}.get(kind, "")
+        _fail(path, f"a {holder} cannot hold {kind}{hint}")
+    for side in ("front", "back") if kind == "twosided" else ():
+        nested = _resolved(getattr(inner, side), bsdfs)
+        if nested is not None and nested.__struct_config__.tag in _MAPS:
+            _fail(f"{path}.{side}", f"a {holder} cannot hold {nested.__struct_config__.tag}")
+
+
+def _check_height(bsdf, path, scene):
+    named = {texture.name: texture for texture in scene.textures}
+    height = named.get(bsdf.height) if isinstance(bsdf.height, str) else bsdf.height
+    if isinstance(height, description.Checkerboard) or getattr(height, "filter", "") == "nearest":
+        found = "a checkerboard" if isinstance(height, description.Checkerboard) else "the filter 'nearest'"
+        _fail(f"{path}.height", f"expected a bitmap with the filter 'bilinear', which has slopes; found {found}")
+
+
+def _kind(bsdf):
+    if isinstance(bsdf, description.Principled) and bsdf.spec_trans != 0.0:
+        return "principled with spec_trans"
+    return bsdf.__struct_config__.tag
+
+
+def _resolved(bsdf, bsdfs):
+    return bsdfs.get(bsdf) if isinstance(bsdf, str) else bsdf
+
+
+def _blended(blend, bsdfs):
+    """Kinds that a blend of blends mixes; a part that is unknown or part of a cycle is left out."""
+    stack, seen = [blend], set()
+    while stack:
+        bsdf = stack.pop()
+        if bsdf is None or id(bsdf) in seen:
+            continue
+        if isinstance(bsdf, description.Blend):
+            seen.add(id(bsdf))
+            stack += [_resolved(bsdf.first, bsdfs), _resolved(bsdf.second, bsdfs)]
+        else:
+            yield _kind(bsdf)
 
 
 def _check_cycle(name, path, bsdfs):

@@ -14,16 +14,14 @@ from wavefront.texture import TextureTables
 
 
 @functools.cache
-def make_aov(
-    aovs: tuple[str, ...], bsdfs: tuple[str, ...], mask: bool, textures: tuple[str, ...], uvs: bool, tangents: bool
-):
+def make_aov(aovs: tuple[str, ...], bsdfs: tuple[str, ...], mask: bool, textures: tuple[str, ...], uvs: bool):
     """Kernel of the stage, one thread per pixel, launched after the camera rays' intersection.
 
     Args:
         aovs: Subset of ``("albedo", "depth", "normal")``; a ray that escapes adds zero to each.
-        bsdfs, mask, textures, uvs, tangents: Fields of `Features`.
+        bsdfs, mask, textures, uvs: Fields of `Features`.
     """
-    _, _, eval_albedo = make_bsdf(bsdfs, mask, textures, tangents)
+    _, _, eval_albedo = make_bsdf(bsdfs, mask, textures, False, False)
 
     @wp.kernel(enable_backward=False, module="unique")
     def accumulate_aovs(

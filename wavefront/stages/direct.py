@@ -37,10 +37,11 @@ def make_direct(
     light_textures: tuple[str, ...],
     uvs: bool,
     tangents: bool,
+    maps: tuple[str, ...],
 ):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
-    eval_bsdf, _, _ = make_bsdf(bsdfs, mask, textures, tangents)
-    frame_at, _ = make_frame(tangents)
+    eval_bsdf, _, _ = make_bsdf(bsdfs, mask, textures, tangents, bool(maps))
+    frame_at, _ = make_frame(tangents, bool(maps))
     sample_light, _ = make_light_sampler(lights, light_textures)
     extended = any(kind not in DELTA for kind in lights)
 

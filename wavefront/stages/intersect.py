@@ -18,12 +18,13 @@ def make_intersect(
     smooth: bool,
     uvs: bool,
     tangents: bool,
+    bumps: bool,
     area_lights: bool,
     escape_lights: bool,
 ):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name (or whether there are any)."""
     closest_hit, _ = make_intersector(triangles, spheres)
-    vertex_of = make_vertex(triangles, spheres, smooth, uvs, tangents)
+    vertex_of = make_vertex(triangles, spheres, smooth, uvs, tangents, bumps)
 
     @wp.kernel(enable_backward=False, module="unique")
     def closest_hits(
@@ -61,6 +62,8 @@ def make_intersect(
             surfaces.uv[slot] = vertex.uv
         if wp.static(tangents):
             surfaces.tangent[slot] = vertex.tangent
+        if wp.static(bumps):
+            surfaces.uv_jacobian[slot] = vertex.uv_jacobian
         if wp.static(area_lights):
             light = int(-1)
             front = wp.dot(vertex.geometric_normal, direction) < 0.0

@@ -29,12 +29,13 @@ def make_scatter(
     textures: tuple[str, ...],
     uvs: bool,
     tangents: bool,
+    maps: tuple[str, ...],
     transmission: bool,
     roulette: bool,
 ):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
-    _, sample_bsdf, _ = make_bsdf(bsdfs, mask, textures, tangents)
-    frame_at, _ = make_frame(tangents)
+    _, sample_bsdf, _ = make_bsdf(bsdfs, mask, textures, tangents, bool(maps))
+    frame_at, _ = make_frame(tangents, bool(maps))
 
     @wp.kernel(enable_backward=False, module="unique")
     def scatter_paths(

@@ -1,0 +1,56 @@
+"""Perturb: turns the shading frames of vertices whose material has a bump or normal map."""
+
+from __future__ import annotations
+
+import functools
+
+import warp as wp
+
+from wavefront.bsdf.maps import make_mapped_frame
+from wavefront.bsdf.tables import MaterialTables
+from wavefront.queues import Paths, Queue, Surfaces, queue_size
+from wavefront.surface import Vertex
+from wavefront.texture import TextureTables
+
+
+@functools.cache
+def make_perturb(textures: tuple[str, ...], uvs: bool, bumps: bool):
+    """Kernel of the stage.
+
+    Args:
+        textures, uvs: Fields of `Features`.
+        bumps: Whether some map is a bump map.
+    """
+    mapped_frame = make_mapped_frame(textures, bumps)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def perturb_frames(
+        materials: MaterialTables,
+        textures: TextureTables,
+        paths: Paths,
+        rays: Queue,
+        # in and out
+        surfaces: Surfaces,
+    ):
+        i = wp.tid()
+        if i >= queue_size(rays):
+            return
+        slot = rays.slots[i]
+        material = surfaces.material[slot]
+        if material < 0:
+            return
+        vertex = Vertex()
+        vertex.geometric_normal = surfaces.geometric_normal[slot]
+        vertex.shading_normal = surfaces.shading_normal[slot]
+        vertex.tangent = surfaces.tangent[slot]
+        if wp.static(uvs):
+            vertex.uv = surfaces.uv[slot]
+        if wp.static(bumps):
+            vertex.uv_jacobian = surfaces.uv_jacobian[slot]
+        frame = mapped_frame(materials, textures, material, vertex, -paths.direction[slot])
+        surfaces.shading_normal[slot] = frame.normal
+        surfaces.tangent[slot] = frame.tangent
+        surfaces.base_normal[slot] = frame.base_normal
+        surfaces.terminator[slot] = frame.terminator
+
+    return perturb_frames
