@@ -254,6 +254,20 @@ def test_reciprocity(name):
     assert np.all(np.abs(forward - backward)[clear] <= tolerance * np.maximum(forward, backward)[clear] + 1e-10)
 
 
+@pytest.mark.parametrize("name", ["clearcoat", "sharp clearcoat"])
+def test_clearcoat_inverts_its_distribution(name):
+    """Burley 2012, equation 2 of appendix B.2: the normal that a number makes, seen from straight above."""
+    wo, u = harness.direction(1.0), harness.uniforms(20_000, 9)
+    s = harness.sample(kind(name), parameters(name), wo, u)
+    alive = (s.pdf > 0.0) & (u[:, 2] < 0.99)
+    assert alive.sum() > 10_000
+    h = wo + s.wi[alive].astype(np.float64)
+    alpha2 = (0.1 + (0.001 - 0.1) * SETS[name].get("clearcoat_gloss", 0.0)) ** 2
+    expected = 1.0 - (1.0 - alpha2 ** (1.0 - u[alive, 1].astype(np.float64))) / (1.0 - alpha2)
+    found = (h[:, 0] ** 2 + h[:, 1] ** 2) / np.sum(h * h, axis=1)
+    np.testing.assert_allclose(found, expected, rtol=2e-5, atol=1e-6 * alpha2)
+
+
 ENDS = [0.0, 2.0**-24, 0.3, 1.0 - 2.0**-23, harness.LARGEST_UNIFORM]
 COSINES = [1.0, 1.0 - 2.0**-24, 0.5, 1e-2, 1e-4, 1e-7, 1e-20, 1e-30, 0.0]
 EXTREMES = [

@@ -69,7 +69,7 @@ def moved(*transform, shape=d.Rectangle):
         ),
         (
             with_bsdfs(d.TwoSided(front=d.Diffuse(), back=d.Principled(spec_trans=0.1))),
-            "bsdfs[0].back: a principled BSDF that transmits is on both sides already; spec_trans must be 0",
+            "bsdfs[0].back: a twosided BSDF cannot hold principled with spec_trans; allowed: " + REFLECTING,
         ),
         (
             with_bsdfs(d.Principled(eta=1.5, specular=0.5)),

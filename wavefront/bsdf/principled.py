@@ -114,26 +114,17 @@ def gtr1_d(m: wp.vec3, alpha: float) -> float:
 
 
 @wp.func
-def expm1(x: float) -> float:
-    """exp(x) - 1 for x >= 0."""
-    if x < 0.1:
-        return x * (1.0 + x * (0.5 + x * (0.16666667 + x * (0.041666667 + x * 0.0083333333))))
-    return wp.exp(x) - 1.0
-
-
-@wp.func
 def sample_gtr1(alpha: float, u: wp.vec2) -> wp.vec3:
     """A normal with density D(m) m.z, by the inverse CDF (Burley 2012, appendix B.2).
 
-    cos^2 = (1 - a^(1 - u)) / (1 - a) with a = alpha^2; sin^2 = (a^(1 - u) - a) / (1 - a) has no cancellation as
-    alpha^2 (exp(-u ln a) - 1) / (1 - a) where the exponential is expanded for small u.
+    With a = alpha^2, cos^2 = (1 - a^(1 - u)) / (1 - a), so that sin^2 = a (a^-u - 1) / (1 - a), which is as precise
+    for a narrow lobe as for a wide one.
     """
-    log_a = 2.0 * wp.log(alpha)
     a = alpha * alpha
-    sin2 = a * expm1(-u[1] * log_a) / (1.0 - a)
-    r = wp.sqrt(wp.clamp(sin2, 0.0, 1.0))
+    sin2 = wp.min(a * (wp.exp(-2.0 * u[1] * wp.log(alpha)) - 1.0) / (1.0 - a), 1.0)
+    r = wp.sqrt(sin2)
     phi = _TWO_PI * u[0]
-    return wp.vec3(r * wp.cos(phi), r * wp.sin(phi), wp.sqrt(wp.max(1.0 - sin2, 0.0)))
+    return wp.vec3(r * wp.cos(phi), r * wp.sin(phi), wp.sqrt(1.0 - sin2))
 
 
 # --- the parts above the surface -------------------------------------------------------------------------------------
