@@ -12,6 +12,7 @@ import os
 import secrets
 import shutil
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -49,7 +50,8 @@ def convert(scene: description.Scene, out: str | os.PathLike) -> None:
 
 
 def _write_meshes(scene, folder, final):
-    """Writes every mesh that comes from a file as PLY in its own space; shapes that share a file share the PLY."""
+    """Writes every mesh that comes from a file as PLY in its own space, broken triangles too; shapes that share a file
+    share the PLY."""
     written: dict[tuple, tuple[Path, bool]] = {}
     taken: set[str] = set()
     for i, shape in enumerate(scene.shapes):
@@ -124,6 +126,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("out", help="the JSON file to write")
     parser.add_argument("-D", dest="parameters", action="append", default=[], metavar="NAME=VALUE",
                         help="a value for $NAME of a Mitsuba scene; camera or scene of a glTF file")  # fmt: skip
+    parser.add_argument("--bake-emitters", action="store_true",
+                        help="let Mitsuba bake a sunsky to an environment map and a sun")  # fmt: skip
     parser.add_argument("--quiet", action="store_true", help="print no warnings")
     options = parser.parse_args(arguments)
     try:
@@ -134,11 +138,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise WavefrontError(f"-D {bad}: expected NAME=VALUE")
         parameters = dict(text.split("=", 1) for text in options.parameters)
         warn = (lambda message: None) if options.quiet else _print_warning
-        convert(load_scene(options.scene, parameters=parameters, warn=warn), options.out)
+        if options.bake_emitters:
+            _convert_baked(options, parameters, warn)
+        else:
+            convert(load_scene(options.scene, parameters=parameters, warn=warn), options.out)
     except WavefrontError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 0
+
+
+def _convert_baked(options, parameters, warn):
+    from tools import bake  # only here: needs Mitsuba
+
+    if Path(options.scene).suffix.lower() != ".xml":
+        raise WavefrontError(f"{options.scene}: --bake-emitters needs a Mitsuba scene")
+    # which of our skies would be used does not matter
+    scene = load_scene(
+        options.scene, parameters=parameters, warn=lambda text: None if "--bake-emitters" in text else warn(text)
+    )
+    with tempfile.TemporaryDirectory(prefix="wavefront-bake-") as folder:
+        baked = bake.bake_sunsky(options.scene, folder, parameters)
+        convert(bake.replace_records(scene, baked), options.out)
 
 
 def _print_warning(message):

@@ -311,6 +311,7 @@ def full_scene(folder):
             d.Point(name="p", position=(0.0, 1.0, 0.5), intensity=[1.0, 0.0, 1e8]),
             d.Spot(position=(0.0, 1.0, 0.5), direction=(0.0, 0.0, 2.0), cutoff_angle=180.0, beam_width=0.0),
             d.Sun(direction=(1.0, 1.0, 0.5), angle=0.5, radiance=[1.0, 2.0, 3.0]),
+            d.SunSky(direction=(1.0, -1.0, 0.5), turbidity=4.0, up=(0.0, 2.0, 0.1), sky_scale=0.0, resolution=64),
         ],
         shapes=[
             d.Mesh(name="m", file=str(folder / "m.ply"), flip_v=True, bsdf="g"),

@@ -30,7 +30,7 @@ def require():
     try:
         import mitsuba
     except ImportError as error:
-        raise WavefrontError(f"Mitsuba is not installed ({error}); pip install 'wavefront[bench]'") from None
+        raise WavefrontError(f"Mitsuba is not installed ({error}); pip install 'wavefront[mitsuba]'") from None
     return mitsuba
 
 

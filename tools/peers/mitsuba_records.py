@@ -107,6 +107,8 @@ class _Writer:
             }
         if isinstance(emitter, description.Sun):
             raise WavefrontError(f"{where}: Mitsuba has no sun that is a disc alone")
+        if isinstance(emitter, description.SunSky):
+            raise WavefrontError(f"{where}: Mitsuba has another sky; compare on one that tools.bake makes")
         return {
             "type": "envmap",
             "filename": emitter.file,

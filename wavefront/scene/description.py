@@ -440,7 +440,27 @@ class Sun(Record, tag_field="type", tag="sun"):
     radiance: Annotated[NonNegative | RGB | None, Meta(description="Of the disc, W / (m^2 sr).")] = None
 
 
-Emitter = Constant | Envmap | Directional | Point | Spot | Sun
+class SunSky(Record, tag_field="type", tag="sunsky"):
+    """A clear sky, baked to an environment map, and the disc of the sun (Preetham, Shirley and Smits 1999).
+
+    Radiance in W / (m^2 sr nm), averaged over the visible spectrum; black below the horizon.
+    """
+
+    direction: Annotated[Vec3, Meta(description="Where the light of the sun travels to: downwards.")]
+    name: str = ""
+    turbidity: Annotated[float, Meta(ge=2.0, le=10.0, description="Haze: 2 is very clear, 10 hazy.")] = 3.0
+    up: Annotated[Vec3, Meta(description="Direction of the zenith.")] = (0.0, 1.0, 0.0)
+    sky_scale: Annotated[NonNegative, Meta(description="Multiplies the radiance of the sky; 0: no sky.")] = 1.0
+    sun_scale: Annotated[NonNegative, Meta(description="Multiplies the radiance of the sun; 0: no sun.")] = 1.0
+    sun_angle: Annotated[
+        float, Meta(gt=0.0, le=90.0, description="Angular radius of the sun, degrees; its irradiance is kept.")
+    ] = 0.2665
+    resolution: Annotated[
+        int, Meta(ge=16, le=8192, description="Rows of the baked map, which has twice as many columns.")
+    ] = 256
+
+
+Emitter = Constant | Envmap | Directional | Point | Spot | Sun | SunSky
 
 # --- shapes ----------------------------------------------------------------------------------------------------
 

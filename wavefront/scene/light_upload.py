@@ -11,7 +11,7 @@ import warp as wp
 
 from wavefront.errors import SceneError
 from wavefront.film import LUMINANCE
-from wavefront.light import tables
+from wavefront.light import sky, tables
 from wavefront.light.envmap import EnvironmentMap, cell_weights, quantized_cdf
 from wavefront.scene import description
 from wavefront.scene.images import load_image
@@ -67,6 +67,9 @@ class LightUpload:
                 self._constant(emitter, cross_section)
             elif isinstance(emitter, description.Envmap):
                 self._envmap(emitter, f"emitters[{i}]", cross_section)
+            elif isinstance(emitter, description.SunSky) and emitter.sky_scale > 0.0:
+                pixels, matrix = baked_sky(emitter)
+                self._map(pixels, emitter.sky_scale, matrix, cross_section)
             elif isinstance(emitter, (description.Point, description.Spot)):
                 self._point(emitter)
             elif isinstance(emitter, description.Directional):
@@ -75,6 +78,8 @@ class LightUpload:
         for emitter in self.scene.emitters:
             if isinstance(emitter, description.Sun):
                 self._sun(emitter, cross_section)
+            elif isinstance(emitter, description.SunSky) and emitter.sun_scale > 0.0:
+                self._sun(sun_disc(emitter), cross_section)
         self.tables.sun_count = self.count - self.tables.first_sun
         self.tables.points = wp.array(self.points, dtype=tables.PointRecord, device=self.device)
         self.tables.distant = wp.array(self.distant, dtype=tables.DistantRecord, device=self.device)
@@ -173,6 +178,19 @@ class LightUpload:
         else:
             radiance = rgb(1.0 if emitter.irradiance is None else emitter.irradiance) / projected
         self._distant("sun", emitter.direction, 2.0 * np.sin(half) ** 2, radiance, cross_section * projected)
+
+
+def baked_sky(emitter: description.SunSky) -> tuple[np.ndarray, np.ndarray]:
+    """The sky as `sky.bake_sky` gives it, without its scale."""
+    return sky.bake_sky(emitter.turbidity, -_unit(emitter.direction), _unit(emitter.up), emitter.resolution)
+
+
+def sun_disc(emitter: description.SunSky) -> description.Sun:
+    """The sun of a sky as a record of its own."""
+    cosine = -_unit(emitter.direction) @ _unit(emitter.up)
+    radiance = sky.sun_radiance(emitter.turbidity, np.arccos(np.clip(cosine, 0.0, 1.0)))
+    irradiance = emitter.sun_scale * np.pi * np.sin(np.radians(sky.SUN_ANGLE)) ** 2 * radiance
+    return description.Sun(direction=emitter.direction, angle=emitter.sun_angle, irradiance=irradiance.tolist())
 
 
 def _unit(vector) -> np.ndarray:

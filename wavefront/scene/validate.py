@@ -259,7 +259,8 @@ def _check_emitters(scene):
     environment = None
     for i, emitter in enumerate(scene.emitters):
         path = f"emitters[{i}]"
-        if isinstance(emitter, (description.Constant, description.Envmap)):
+        sky = isinstance(emitter, description.SunSky) and emitter.sky_scale > 0.0
+        if sky or isinstance(emitter, (description.Constant, description.Envmap)):
             if environment is not None:
                 _fail(path, f"a scene has at most one environment; {environment} is one already")
             environment = path
@@ -270,12 +271,26 @@ def _check_emitters(scene):
         direction = getattr(emitter, "direction", None)
         if direction is not None and not np.linalg.norm(direction) > 0.0:
             _fail(f"{path}.direction", "the direction is zero")
+        if isinstance(emitter, description.SunSky):
+            _check_sun(emitter, path)
         if isinstance(emitter, description.Spot):
             if emitter.beam_width is not None and emitter.beam_width > emitter.cutoff_angle:
                 found = f"{emitter.beam_width:g} and {emitter.cutoff_angle:g}"
                 _fail(f"{path}.beam_width", f"expected at most cutoff_angle; found {found}")
         if isinstance(emitter, description.Sun) and emitter.irradiance is not None and emitter.radiance is not None:
             _fail(path, "a sun has irradiance or radiance; found both")
+
+
+def _check_sun(emitter, path):
+    length = np.linalg.norm(emitter.up)
+    if not length > 0.0:
+        _fail(f"{path}.up", "the direction is zero")
+    sine = -np.dot(emitter.direction, emitter.up) / (length * np.linalg.norm(emitter.direction))
+    if not sine > 0.0:
+        elevation = np.degrees(np.arcsin(max(sine, -1.0)))
+        _fail(
+            f"{path}.direction", f"the sky is one of daylight; found the sun {elevation:.1f} degrees above the horizon"
+        )
 
 
 # --- shapes ----------------------------------------------------------------------------------------------------
