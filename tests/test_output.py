@@ -54,8 +54,8 @@ def test_header_and_channels(renderer, tmp_path, monkeypatch):
     assert header["pixelAspectRatio"] == 1.25
     assert header["samplesPerPixel"] == 2
     assert header["seed"] == str(SEED)
-    assert header["sceneSHA256"] == scene_hash(renderer.scene)
-    assert header["Software"] == f"wavefront {wavefront.__version__}"
+    assert header["sceneHash"] == scene_hash(renderer.scene_records)
+    assert header["renderer"] == f"wavefront {wavefront.__version__}"
     assert "capDate" not in header
     expected = renderer.film.channels()
     assert set(channels) == set(expected)

@@ -13,7 +13,7 @@ import secrets
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from wavefront.errors import SceneError, WavefrontError
@@ -23,12 +23,8 @@ from wavefront.scene.images import replacing
 from wavefront.scene.lookup import walk
 
 
-def convert(
-    scene: description.Scene, out: str | os.PathLike, warn: Callable[[str], object] = lambda message: None
-) -> None:
+def convert(scene: description.Scene, out: str | os.PathLike) -> None:
     """Writes `scene` (file paths absolute) as JSON with its meshes and textures beside it. `scene` is not changed.
-
-    `warn` is called with a line of text for each thing that a mesh loses.
 
     Raises:
         WavefrontError: A mesh or texture is missing or not readable, or the output cannot be written.
@@ -39,7 +35,7 @@ def convert(
     staged = {kind: out.parent / f".{name}.{mark}.tmp" for kind, name in names.items()}
     scene = json_format.checked(scene)  # a copy
     try:
-        _write_meshes(scene, staged["meshes"], out.parent / names["meshes"], warn)
+        _write_meshes(scene, staged["meshes"], out.parent / names["meshes"])
         _copy_textures(scene, staged["textures"], out.parent / names["textures"])
         with replacing(out) as temporary:
             temporary.write_text(json_format.dumps(scene, out.parent), encoding="utf-8")
@@ -53,8 +49,9 @@ def convert(
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def _write_meshes(scene, folder, final, warn):
-    """Writes every mesh that comes from a file as PLY in its own space; shapes that share a file share the PLY."""
+def _write_meshes(scene, folder, final):
+    """Writes every mesh that comes from a file as PLY in its own space, broken triangles too; shapes that share a file
+    share the PLY."""
     written: dict[tuple, tuple[Path, bool]] = {}
     taken: set[str] = set()
     for i, shape in enumerate(scene.shapes):
@@ -68,8 +65,6 @@ def _write_meshes(scene, folder, final, warn):
                 file=shape.file, part=shape.part, face_normals=shape.face_normals, flip_v=shape.flip_v
             )
             mesh = meshes.own_space(plain, f"shapes[{i}]")
-            for note in mesh.notes:
-                warn(f"{shape.file}: {note}")
             meshes.write_ply(folder / name, mesh)
             written[key] = final / name, mesh.normals is not None
         path, has_normals = written[key]
@@ -146,7 +141,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.bake_emitters:
             _convert_baked(options, parameters, warn)
         else:
-            convert(load_scene(options.scene, parameters=parameters, warn=warn), options.out, warn)
+            convert(load_scene(options.scene, parameters=parameters, warn=warn), options.out)
     except WavefrontError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -164,7 +159,7 @@ def _convert_baked(options, parameters, warn):
     )
     with tempfile.TemporaryDirectory(prefix="wavefront-bake-") as folder:
         baked = bake.bake_sunsky(options.scene, folder, parameters)
-        convert(bake.replace_records(scene, baked), options.out, warn)
+        convert(bake.replace_records(scene, baked), options.out)
 
 
 def _print_warning(message):

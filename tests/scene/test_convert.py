@@ -5,6 +5,9 @@ import pytest
 from PIL import Image
 
 from tools import convert
+from tools.make_scenes import FOLDER as SCENES
+from wavefront import Renderer
+from wavefront.output import scene_hash
 from wavefront.scene import description as d
 from wavefront.scene import load_scene, meshes
 from wavefront.scene.mitsuba import UNLIMITED_DEPTH
@@ -115,6 +118,46 @@ def test_errors_are_one_line_and_leave_nothing(scene_file, tmp_path, capsys, mon
     assert error.startswith("error: ")
     assert error.count("\n") == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+LIT = """<scene version="3.0.0">
+<integrator type="path"><integer name="max_depth" value="4"/></integrator>
+<sensor type="perspective"><float name="fov" value="50"/>
+  <transform name="to_world"><lookat origin="0.5, 0.5, 3" target="0.5, 0.5, 0" up="0, 1, 0"/></transform>
+  <film type="hdrfilm"><integer name="width" value="24"/><integer name="height" value="16"/>
+    <rfilter type="tent"/></film></sensor>
+<shape type="obj"><string name="filename" value="a/mesh.obj"/>
+  <transform name="to_world"><rotate y="1" angle="20"/></transform>
+  <bsdf type="diffuse"><rgb name="reflectance" value="0.2, 0.5, 0.7"/></bsdf></shape>
+<shape type="obj"><string name="filename" value="b/mesh.obj"/></shape>
+<shape type="rectangle"><emitter type="area"><rgb name="radiance" value="5, 4, 3"/></emitter>
+  <transform name="to_world"><rotate y="1" angle="180"/><translate z="4"/></transform></shape>
+</scene>
+"""
+
+
+def test_mitsuba_scene_converted_has_the_same_image(scene_file, tmp_path):
+    """The kernels are those of the Cornell box."""
+    scene_file.write_text(LIT)
+    out = tmp_path / "room.json"
+    assert convert.main([str(scene_file), str(out), "--quiet"]) == 0
+    images = [Renderer(load_scene(path), seed=5).render(4) for path in (scene_file, out)]
+    assert (images[0] > 0.0).mean() > 0.1
+    np.testing.assert_array_equal(*images)
+
+
+@pytest.mark.parametrize("name", ["cornell-box", "material-diffuse-bitmap", "light-envmap", "material-twosided"])
+def test_converting_json_keeps_the_hash(name, tmp_path):
+    """Of a scene with text meshes from the first time on that they are binary."""
+    hashes = []
+    source = SCENES / f"{name}.json"
+    for i in range(2):
+        hashes.append(scene_hash(load_scene(source)))
+        source, last = tmp_path / f"{i}.json", source
+        assert convert.main([str(last), str(source)]) == 0
+    hashes.append(scene_hash(load_scene(source)))
+    assert hashes[1] == hashes[2]
+    assert (hashes[0] == hashes[1]) == (name != "material-twosided")
 
 
 def test_parameters(scene_file, tmp_path):

@@ -378,7 +378,7 @@ ERRORS = [
     (["extensionsRequired"], ["KHR_draco_mesh_compression"], "extensionsRequired[0]: the extension"),
     (["nodes", 0, "mesh"], 7, "nodes[0].mesh: index 7 is out of range; meshes has 1"),
     (["nodes", 0, "mesh"], -1, "nodes[0].mesh: expected an integer >= 0 or null; found -1"),
-    (["nodes", 0, "camera"], 0, "index 0 is out of range; cameras has 0"),
+    (["nodes", 0, "camera"], 0, "nodes[0].camera: index 0 is out of range; cameras has 0"),
     (["nodes", 0, "children"], [0], "nodes[0].children: node 0 is reached twice"),
     (["nodes", 0, "children"], [3], "nodes[0].children[0]: index 3 is out of range"),
     (["nodes", 0, "rotation"], [0, 0, 0, 0], "nodes[0].rotation: the quaternion is zero"),

@@ -225,6 +225,19 @@ def test_texture_transform(builder, tmp_path):
     np.testing.assert_allclose(bsdf.base_color.uv_transform, [(0, 5, 3), (-2, 0, 4)], atol=1e-15)
 
 
+def test_normal_textures(builder, tmp_path):
+    """Around both sides, as seen from behind the same bumps are hollows; inside the mask."""
+    normal = {"index": builder.texture(png()), "scale": 0.5}
+    _, bsdf, warnings = load(
+        builder, tmp_path, normalTexture=normal, doubleSided=True, alphaMode="BLEND",
+        pbrMetallicRoughness={"baseColorFactor": [1, 1, 1, 0.5]},
+    )  # fmt: skip
+    image = d.Bitmap(file=str(tmp_path / "a.glb"), image=0, color_space="linear")
+    around = d.NormalMap(bsdf=d.TwoSided(front=principled()), normal=image, scale=0.5)
+    assert bsdf == d.Mask(name="material 0", bsdf=around, opacity=0.5)
+    assert warnings == []
+
+
 def test_sets_of_coordinates(builder, tmp_path):
     texture = builder.texture(png())
     pbr = {"baseColorTexture": {"index": texture, "texCoord": 1}}
@@ -276,6 +289,9 @@ def test_glass(builder, tmp_path):
     solid = principled(name="material 0", base_color=tint, metallic=0.0, roughness=0.0, spec_trans=1.0, eta=1.3)
     volume = {"KHR_materials_volume": {"thicknessFactor": 0.1}}
     assert glass({"transmissionFactor": 1}, doubleSided=True, extensions=volume) == (solid, [])
+    volume["KHR_materials_volume"] |= {"attenuationDistance": 1, "attenuationColor": [1, 0, 0]}
+    _, warnings = glass({"transmissionFactor": 1}, extensions=volume)
+    assert warnings == ["materials[0]: the absorption of KHR_materials_volume is left out"]
     solid.spec_trans = 0.5
     bsdf, warnings = glass({"transmissionFactor": 0.5})
     assert bsdf == solid

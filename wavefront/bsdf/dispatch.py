@@ -33,9 +33,12 @@ def is_delta_transmission(kind: int) -> bool:
 
 @wp.func
 def transmits(kind: int) -> bool:
-    if is_delta_transmission(kind) or kind == KIND_ROUGH_DIELECTRIC:
-        return True
-    return kind == KIND_PRINCIPLED_TRANSMISSIVE or kind == KIND_BLEND_TRANSMISSIVE
+    return (
+        is_delta_transmission(kind)
+        or kind == KIND_ROUGH_DIELECTRIC
+        or kind == KIND_PRINCIPLED_TRANSMISSIVE
+        or kind == KIND_BLEND_TRANSMISSIVE
+    )
 
 
 @wp.func

@@ -203,8 +203,8 @@ class _Importer:
                 raise SceneError(unknown_name("camera", self.parameters["camera"], ()), self.document.path)
             self._note("cameras", "the scene has no camera; one is put where it sees all meshes")
             return self._overview(), description.Film(width=FILM_SIZE, height=FILM_SIZE)
-        for _, camera, _ in self.cameras:
-            self.document.item("cameras", camera, "nodes")
+        for node, camera, _ in self.cameras:
+            self.document.item("cameras", camera, f"nodes[{node}].camera")
         node, camera_index, matrix = self.cameras[0]
         wanted = self.parameters.get("camera")
         if wanted is not None:

@@ -129,10 +129,11 @@ def read_primitive(document: Document, mesh: int, primitive: int, uv_set: int = 
             message = f"index out of range: {corners.max()}, and there are {count} vertices"
             raise document.error(f"{where}.indices", message)
     faces = _faces(document, corners, record.mode, where)
-    used, inverse = np.unique(faces, return_inverse=True)
-    if len(used) < count:  # primitives may share one long list of vertices
+    used = np.zeros(count, bool)
+    used[faces] = True
+    if not used.all():  # primitives may share one long list of vertices
         vertices, normals, uvs = (array if array is None else array[used] for array in (vertices, normals, uvs))
-        faces = inverse.reshape(-1, 3)
+        faces = (np.cumsum(used) - 1)[faces]
     return Triangles(vertices, faces, normals, uvs)
 
 

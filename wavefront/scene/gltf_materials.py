@@ -134,6 +134,9 @@ class _Converter:
             )
             if record.spec_trans != 0.0 and not self._is_solid():
                 self._warn("a thin wall that transmits in part is taken as the boundary of a solid")
+        volume = self.extensions.volume
+        if volume is not None and volume.attenuation_distance is not None and record.spec_trans != 0.0:
+            self._warn("the absorption of KHR_materials_volume is left out")
         self._reflectance(record)
         self._clearcoat(record)
         self._sheen(record)

@@ -173,7 +173,7 @@ def _check_nesting(bsdf, path, bsdfs):
             inner = bsdfs.get(inner)  # an unknown name is reported where the reference is checked
         if inner is None:
             continue
-        kind = inner.__struct_config__.tag
+        kind = _kind(inner)
         if isinstance(bsdf, description.TwoSided):
             _check_side(kind, inner, place, bsdfs)
         elif isinstance(bsdf, description.Mask) and kind == "mask":
@@ -188,7 +188,7 @@ def _check_side(kind, inner, path, bsdfs):
     """A side of a two-sided BSDF reflects."""
     if kind in _MAPS:
         inner = _resolved(inner.bsdf, bsdfs)
-        kind, path = (inner.__struct_config__.tag if inner is not None else "diffuse"), f"{path}.bsdf"
+        kind, path = (_kind(inner) if inner is not None else "diffuse"), f"{path}.bsdf"
     allowed = f"allowed: {', '.join(_REFLECTING)}, a blend of those, and a normal_map or bump_map around one"
     if kind == "blend":
         for part in _blended(inner, bsdfs):
@@ -196,8 +196,6 @@ def _check_side(kind, inner, path, bsdfs):
                 _fail(path, f"a twosided BSDF cannot hold a blend with {part}; {allowed}")
     elif kind not in _REFLECTING:
         _fail(path, f"a twosided BSDF cannot hold {kind}; {allowed}")
-    elif kind == "principled" and inner.spec_trans != 0.0:
-        _fail(path, "a principled BSDF that transmits is on both sides already; spec_trans must be 0")
 
 
 def _check_map(holder, kind, inner, path, bsdfs):
@@ -214,8 +212,14 @@ def _check_height(bsdf, path, scene):
     named = {texture.name: texture for texture in scene.textures}
     height = named.get(bsdf.height) if isinstance(bsdf.height, str) else bsdf.height
     if isinstance(height, description.Checkerboard) or getattr(height, "filter", "") == "nearest":
-        found = "a checkerboard" if isinstance(height, description.Checkerboard) else "the filter 'nearest'"
+        found = "a checkerboard" if isinstance(height, description.Checkerboard) else "filter 'nearest'"
         _fail(f"{path}.height", f"expected a bitmap with the filter 'bilinear', which has slopes; found {found}")
+
+
+def _kind(bsdf):
+    if isinstance(bsdf, description.Principled) and bsdf.spec_trans != 0.0:
+        return "principled with spec_trans"
+    return bsdf.__struct_config__.tag
 
 
 def _resolved(bsdf, bsdfs):
@@ -233,7 +237,7 @@ def _blended(blend, bsdfs):
             seen.add(id(bsdf))
             stack += [_resolved(bsdf.first, bsdfs), _resolved(bsdf.second, bsdfs)]
         else:
-            yield bsdf.__struct_config__.tag
+            yield _kind(bsdf)
 
 
 def _check_cycle(name, path, bsdfs):
