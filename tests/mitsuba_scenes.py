@@ -72,6 +72,7 @@ def _speck(bsdf: str, x: float, emitter: str = "", shape: str = "rectangle") -> 
   </shape>"""
 
 
+_WEIGHT = '<float name="weight" value="0.3"/>'
 METAL = '<rgb name="eta" value="0.2, 0.9, 1.1"/><rgb name="k" value="3.9, 2.4, 2.2"/>'
 EVERYTHING = "\n  ".join(
     [
@@ -86,10 +87,19 @@ EVERYTHING = "\n  ".join(
         _speck(f'<bsdf type="roughconductor">{METAL}</bsdf>', 0.3),
         _speck('<bsdf type="dielectric"/>', 0.4),
         _speck('<bsdf type="roughdielectric"/>', 0.5),
+        _speck(
+            '<bsdf type="bumpmap"><texture type="bitmap"><string name="filename" value="height.exr"/></texture>'
+            f'<bsdf type="blendbsdf">{_WEIGHT}<bsdf type="diffuse"/><bsdf type="diffuse"/></bsdf></bsdf>',
+            1.2,
+        ),
+        _speck(
+            '<bsdf type="normalmap"><rgb name="normalmap" value="0.5, 0.5, 1"/><bsdf type="diffuse"/></bsdf>',
+            1.3,
+        ),
         _speck('<bsdf type="thindielectric"/>', 1.0),
         _speck('<bsdf type="null"/>', 1.1),
-        _speck('<bsdf type="principled"><float name="anisotropic" value="0.5"/></bsdf>', 1.2),
-        _speck('<bsdf type="principled"><float name="spec_trans" value="0.5"/></bsdf>', 1.3),
+        _speck('<bsdf type="principled"><float name="anisotropic" value="0.5"/></bsdf>', 1.4),
+        _speck('<bsdf type="principled"><float name="spec_trans" value="0.5"/></bsdf>', 1.5),
         _speck('<bsdf type="plastic"/>', 0.8),
         _speck('<bsdf type="roughplastic"/>', 0.9),
         _speck("", 0.6, '<emitter type="area"><rgb name="radiance" value="1"/></emitter>'),
@@ -124,7 +134,7 @@ def in_dialect_0_6(text: str) -> str:
 
 def _texture(parameter: str, wrap: str = "repeat", scale: float = 2.6, raw: bool = False) -> str:
     return f"""<texture name="{parameter}" type="bitmap">
-      <string name="filename" value="{"opacity" if parameter == "opacity" else "texture"}.png"/>
+      <string name="filename" value="{"opacity" if parameter in ("opacity", "weight") else "texture"}.png"/>
       <string name="wrap_mode" value="{wrap}"/><boolean name="raw" value="{str(raw).lower()}"/>
       <transform name="to_uv"><scale x="{scale}" y="{0.7 * scale}"/><translate x="-0.35" y="-0.2"/></transform>
     </texture>"""
@@ -197,6 +207,30 @@ PLAIN: dict[str, list[str]] = {
     ],
 }
 
+
+def _brushed(kind: str, distribution: str, alpha_u: float, alpha_v: float, rest: str) -> str:
+    return f"""<bsdf type="{kind}"><string name="distribution" value="{distribution}"/>
+      <float name="alpha_u" value="{alpha_u}"/><float name="alpha_v" value="{alpha_v}"/>{rest}
+    </bsdf>"""
+
+
+def _bump(nested: str, scale: float) -> str:
+    return f"""<bsdf type="bumpmap"><float name="scale" value="{scale}"/>
+    <texture name="map" type="bitmap"><string name="filename" value="height.exr"/>
+      <transform name="to_uv"><scale x="2" y="3"/></transform></texture>{nested}</bsdf>"""
+
+
+def _normals(nested: str) -> str:
+    return f"""<bsdf type="normalmap">
+    <texture name="normalmap" type="bitmap"><string name="filename" value="normals.exr"/></texture>{nested}</bsdf>"""
+
+
+def _blend(weight: str, first: str, second: str) -> str:
+    return f'<bsdf type="blendbsdf">{weight}{first}{second}</bsdf>'
+
+
+_METAL = _rough("roughconductor", "ggx", 0.3, METAL)
+
 # The kernels of a scene with all kinds of everything.
 MIXED: dict[str, list[str]] = {
     "conductor": [FLOOR, WEAK_LAMP, SKY, ball('<bsdf type="conductor"><string name="material" value="Au"/></bsdf>')],
@@ -254,6 +288,71 @@ MIXED: dict[str, list[str]] = {
         SKY,
         panel(f'<bsdf type="twosided">{_principled(rest=_texture("base_color") + _METALLIC)}</bsdf>'),
     ],
+    "brushed metal, GGX": [FLOOR, LAMP, SKY, panel(_brushed("roughconductor", "ggx", 0.5, 0.1, METAL))],
+    "brushed metal, Beckmann": [FLOOR, WEAK_LAMP, SKY, ball(_brushed("roughconductor", "beckmann", 0.2, 0.5, METAL))],
+    "brushed metal on a mesh": [
+        FLOOR,
+        WEAK_LAMP,
+        SKY,
+        f"""<shape type="obj"><string name="filename" value="ball.obj"/>
+    <transform name="to_world"><scale x="1.1" y="0.8"/><translate y="1"/></transform>
+    {_brushed("roughconductor", "ggx", 0.15, 0.5, METAL)}</shape>""",
+    ],
+    "brushed glass": [FLOOR, SKY, ball(_brushed("roughdielectric", "ggx", 0.5, 0.15, _GLASS))],
+    "bump map": [FLOOR, LAMP, SKY, panel(_bump(_PAINT.format("0.8, 0.3, 0.2"), 0.4))],
+    "bump map around two sides, the back": [FLOOR, LAMP, SKY, panel(_bump(_TWO_SIDES, 0.4), 130.0)],
+    "bump map inside of two sides, the back": [
+        FLOOR,
+        LAMP,
+        SKY,
+        panel(f'<bsdf type="twosided">{_bump(_PAINT.format("0.8, 0.2, 0.1"), 0.4)}{_bump(_METAL, -0.6)}</bsdf>', 130.0),
+    ],
+    "bump map on a ball": [FLOOR, WEAK_LAMP, SKY, ball(_bump(_METAL, 0.4))],
+    "bump map on a disk": [
+        FLOOR,
+        LAMP,
+        SKY,
+        f"""<shape type="disk"><transform name="to_world"><rotate x="1" angle="-50"/><translate y="1"/></transform>
+    {_bump(_PAINT.format("0.8, 0.3, 0.2"), 0.4)}</shape>""",
+    ],
+    "bump map on a mesh": [
+        FLOOR,
+        WEAK_LAMP,
+        SKY,
+        f"""<shape type="obj"><string name="filename" value="ball.obj"/>
+    <transform name="to_world"><translate y="1"/></transform>{_bump(_PAINT.format("0.3, 0.6, 0.7"), 0.4)}</shape>""",
+    ],
+    "normal map": [FLOOR, LAMP, SKY, panel(_normals(_METAL))],
+    "normal map on ground glass": [FLOOR, SKY, ball(_normals(_rough("roughdielectric", "ggx", 0.3, _GLASS)))],
+    "normal map in a mask": [
+        FLOOR,
+        WEAK_LAMP,
+        SKY,
+        panel(
+            f'<bsdf type="mask"><float name="opacity" value="0.6"/>{_normals(_PAINT.format("0.8, 0.3, 0.2"))}</bsdf>'
+        ),
+    ],
+    "blend": [
+        FLOOR,
+        LAMP,
+        SKY,
+        panel(
+            f'<bsdf type="twosided">{_blend(_WEIGHT, _PAINT.format("0.8, 0.3, 0.2"), _METAL)}</bsdf>',
+            130.0,
+        ),
+    ],
+    "blend bitmap": [
+        FLOOR,
+        LAMP,
+        SKY,
+        panel(
+            _blend(
+                _texture("weight", raw=True),
+                _PAINT.format("0.8, 0.3, 0.2"),
+                _blend(_WEIGHT, _PAINT.format("0.1, 0.3, 0.8"), _METAL),
+            )
+        ),
+    ],
     "opacity": [
         FLOOR,
         WEAK_LAMP,
@@ -296,6 +395,19 @@ MIXED: dict[str, list[str]] = {
     <emitter type="area"><rgb name="radiance" value="6, 7, 8"/></emitter></shape>""",
     ],
 }
+
+# Scenes of MIXED that run with the slow tests alone: variants of others.
+VARIANTS = (
+    "brushed metal, Beckmann",
+    "brushed metal on a mesh",
+    "bump map",
+    "bump map around two sides, the back",
+    "bump map on a ball",
+    "bump map on a disk",
+    "normal map",
+    "normal map in a mask",
+    "blend",
+)
 
 _BOX = f"""<shape type="cube"><transform name="to_world"><scale value="0.6"/><rotate y="1" angle="30"/>
     <translate x="0.2" y="0.6"/></transform>{_PAINT.format("0.7, 0.7, 0.2")}</shape>"""
@@ -394,6 +506,12 @@ def write_files(folder: Path) -> None:
     texture = rng.integers(20, 250, (5, 7, 3), dtype=np.uint8)
     Image.fromarray(texture).save(folder / "texture.png")
     Image.fromarray(rng.integers(0, 255, (4, 6), dtype=np.uint8)).save(folder / "opacity.png")
+    y, x = np.mgrid[0:6, 0:8]
+    height = (0.2 * np.sin(0.25 * np.pi * x) * np.cos(np.pi * y / 3.0)).astype(np.float32)
+    write_exr(folder / "height.exr", {"Y": height})
+    normals = np.stack([0.5 * np.sin(0.25 * np.pi * x), 0.4 * np.cos(np.pi * y / 3.0), np.ones(x.shape)])
+    normals = 0.5 + 0.5 * normals / np.linalg.norm(normals, axis=0)
+    write_exr(folder / "normals.exr", {name: normals[i].astype(np.float32) for i, name in enumerate("RGB")})
     sky = np.exp(rng.normal(size=(6, 10, 3))).astype(np.float32)
     sky[2, 3] = (20.0, 16.0, 8.0)
     write_exr(folder / "sky.exr", {name: sky[:, :, i] for i, name in enumerate("RGB")})

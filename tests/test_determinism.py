@@ -25,7 +25,7 @@ def film(r, spp=SPP):
     return r.film.arrays.L.numpy()
 
 
-@pytest.fixture(scope="module", params=["cornell-box", "material-mask"])
+@pytest.fixture(scope="module", params=["cornell-box", "material-mask", "material-bump-map"])
 def name(request):
     return request.param
 

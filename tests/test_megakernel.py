@@ -92,7 +92,8 @@ def test_own_scene_settings(name, nee, rr_depth):
 
 
 def mixed_scene():
-    """Everything at once: a textured light, spheres that emit outwards and inwards, a mask, glass, an environment."""
+    """Everything at once: a textured light, spheres that emit outwards and inwards, a mask, glass, an environment, bump
+    and normal maps, brushed metal, and a blend of a blend."""
     checks = d.Checkerboard(color0=[2.0, 1.0, 0.5], color1=0.25, uv_transform=((4.0, 0.0, 0.0), (0.0, 4.0, 0.0)))
     opacity = d.Checkerboard(color0=1.0, color1=0.25, uv_transform=((6.0, 0.0, 0.0), (0.0, 6.0, 0.0)))
     turned = [d.TransformStep(scale=(3.0, 3.0, 1.0)), d.TransformStep(rotate=d.Rotate(axis=(1, 0, 0), angle=-90.0))]
@@ -115,6 +116,32 @@ def mixed_scene():
         d.Sphere(center=(0.1, 0.5, 0.7), radius=0.4, bsdf=d.RoughDielectric(alpha=0.2)),
         d.Sphere(center=(0.5, 0.3, 1.3), radius=0.25, bsdf=d.Dielectric()),
         d.Sphere(center=(-0.5, 0.3, 1.3), radius=0.25, bsdf=d.RoughConductor(material="Au", alpha=0.15)),
+        d.Sphere(
+            center=(0.9, 0.3, 1.5),
+            radius=0.3,
+            bsdf=d.NormalMap(
+                bsdf=d.Blend(
+                    first=d.Blend(first=d.Diffuse(), second=d.Dielectric(), weight=checks.color1),
+                    second=d.RoughDielectric(alpha_u=0.4, alpha_v=0.2),
+                    weight=opacity,
+                ),
+                normal=d.Checkerboard(color0=[0.4, 0.6, 0.9], color1=[0.8, 0.5, 0.8]),
+            ),
+        ),
+        d.Disk(
+            bsdf=d.TwoSided(
+                front=d.BumpMap(
+                    bsdf=d.RoughConductor(material="Au", alpha_u=0.1, alpha_v=0.3),
+                    height=d.Bitmap(file=str(SCENES / "textures" / "dents.png")),
+                    scale=-0.2,
+                )
+            ),
+            to_world=[
+                d.TransformStep(scale=(0.5, 0.3, 1.0)),
+                d.TransformStep(rotate=d.Rotate(axis=(1, 1, 0), angle=-70.0)),
+                d.TransformStep(translate=(-0.9, 0.6, 1.4)),
+            ],
+        ),
         d.Sphere(radius=9.0, flip_normals=True, bsdf=d.Diffuse(reflectance=0.1), emitter=d.Area(radiance=0.05)),
     ]
     camera = d.Perspective(

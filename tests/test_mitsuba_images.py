@@ -108,7 +108,9 @@ def test_plain(folder, name):
     check_small(folder, name, scenes.document(scenes.PLAIN[name], everything=False))
 
 
-@pytest.mark.parametrize("name", scenes.MIXED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in scenes.VARIANTS)) for name in scenes.MIXED]
+)
 def test_mixed(folder, name):
     check_small(folder, name, scenes.document(scenes.MIXED[name], everything=True))
 

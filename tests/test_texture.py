@@ -8,6 +8,7 @@ from wavefront.texture import (
     WRAP_MODES,
     TextureRecord,
     TextureTables,
+    make_eval_gradient,
     make_eval_texture,
     srgb_to_linear,
 )
@@ -26,6 +27,21 @@ def texture_kernel(
 ):
     i = wp.tid()
     values[i] = eval_texture(tables, texture, uv[i])
+
+
+eval_gradient = make_eval_gradient(("bytes", "checkerboard", "floats"))
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def gradient_kernel(
+    tables: TextureTables,
+    texture: int,
+    uv: wp.array(dtype=wp.vec2),
+    # outputs
+    values: wp.array(dtype=wp.vec2),
+):
+    i = wp.tid()
+    values[i] = eval_gradient(tables, texture, uv[i])
 
 
 RNG = np.random.default_rng(1)
@@ -215,3 +231,32 @@ def test_coordinates_that_are_not_finite_give_black(name):
     values = look_up(tables, texture, uv)
     assert (values[:3] == 0.0).all()
     assert np.isfinite(values).all()
+
+
+@pytest.mark.parametrize("wrap", WRAP_MODES)
+@pytest.mark.parametrize("name", ["rgb", "grey", "float rgb", "float grey", "one pixel", "checkerboard"])
+def test_gradients_are_differences_of_the_luminance(name, wrap):
+    """Of lookups that float32 has no part in but its own rounding: within a cell between pixel centres the texture is
+    bilinear, so central differences are exact. The transform turns, and scales u and v each in its own way."""
+    rows = ((0.7, -0.4, 0.1), (0.3, 0.5, -0.2))
+    tables, texture = upload(name, srgb=name == "rgb", wrap=wrap, rows=rows)
+    rng = np.random.default_rng(3)
+    uv = rng.uniform(-1.0, 1.0, (4000, 2)).astype(np.float32)
+    out = wp.zeros(len(uv), dtype=wp.vec2, device=DEVICE)
+    inputs = [tables, texture, wp.array(uv, dtype=wp.vec2, device=DEVICE)]
+    wp.launch(gradient_kernel, dim=len(uv), inputs=inputs, outputs=[out], device=DEVICE)
+    found = out.numpy()
+    if name in ("one pixel", "checkerboard"):
+        assert not found.any()
+        return
+    h = 2.0**-9
+    height, width, _ = IMAGES[name].shape
+    pixel = (uv.astype(np.float64) @ np.array(rows)[:, :2].T + np.array(rows)[:, 2]) * (width, height) - 0.5
+    inside = (np.abs(pixel - np.floor(pixel) - 0.5) < 0.5 - 2.0 * h * max(width, height)).all(axis=1)
+    assert inside.mean() > 0.8
+    for axis in (0, 1):
+        step = np.zeros(2, np.float32)
+        step[axis] = h
+        difference = (look_up(tables, texture, uv + step) - look_up(tables, texture, uv - step)).astype(np.float64)
+        expected = difference @ (0.212671, 0.715160, 0.072169) / (2.0 * h)
+        np.testing.assert_allclose(found[inside, axis], expected[inside], atol=2e-3)

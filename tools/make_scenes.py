@@ -7,6 +7,7 @@ on every run.
 from __future__ import annotations
 
 import argparse
+import copy
 import math
 from pathlib import Path
 
@@ -19,7 +20,9 @@ from wavefront.scene import json_format
 from wavefront.scene.description import (
     Area,
     Bitmap,
+    Blend,
     Bsdf,
+    BumpMap,
     Checkerboard,
     Conductor,
     Constant,
@@ -28,6 +31,7 @@ from wavefront.scene.description import (
     Disk,
     Mask,
     Mesh,
+    NormalMap,
     Null,
     OrenNayar,
     PathIntegrator,
@@ -66,6 +70,9 @@ def write(folder: Path) -> list[str]:
     Image.fromarray(tiles()).save(folder / names[2], optimize=True)
     names.append("textures/sky.exr")
     light_scenes.write_sky(folder / names[3])
+    for name, pixels in (("textures/dents.png", dents()), ("textures/scales.png", scales())):
+        Image.fromarray(pixels).save(folder / name, optimize=True)
+        names.append(name)
     scenes = {
         "cornell-box.json": cornell_box(),
         "furnace.json": furnace(),
@@ -223,6 +230,11 @@ def material_balls(folder: Path) -> dict[str, Scene]:
             RoughConductor(material="Cu", alpha=0.2, distribution="beckmann"),
             None,
         ),
+        "rough-conductor-anisotropic": (
+            "brushed metal, in circles about the axis",
+            RoughConductor(material="Al", alpha_u=0.05, alpha_v=0.35),
+            None,
+        ),
         "dielectric": ("clear glass", Dielectric(int_ior="bk7"), None),
         "rough-dielectric": ("ground glass", RoughDielectric(int_ior="bk7", alpha=0.15), None),
         "thin-dielectric": ("a soap bubble's wall: a thin sheet of glass", ThinDielectric(int_ior="bk7"), None),
@@ -237,6 +249,36 @@ def material_balls(folder: Path) -> dict[str, Scene]:
             "the principled BSDF: an image under a lacquer",
             Principled(base_color=tiles, roughness=0.6, clearcoat=1.0, clearcoat_gloss=0.9),
             None,
+        ),
+        "blend": (
+            "stripes of gold on blue paint",
+            Blend(
+                first=Diffuse(reflectance=[0.15, 0.3, 0.6]),
+                second=RoughConductor(material="Au", alpha=0.2),
+                weight=stripes,
+            ),
+            None,
+        ),
+        "normal-map": (
+            "a rough coating with a pattern of scales in an image of normals",
+            NormalMap(
+                bsdf=RoughPlastic(diffuse_reflectance=[0.1, 0.35, 0.2], alpha=0.1),
+                normal=Bitmap(
+                    file=str(folder / "textures" / "scales.png"), uv_transform=((12.0, 0.0, 0.0), (0.0, 6.0, 0.0))
+                ),
+            ),
+            None,
+        ),
+        "bump-map": (
+            "a bowl of hammered copper, by a height field",
+            BumpMap(
+                bsdf=TwoSided(front=RoughConductor(material="Cu", alpha_u=0.1, alpha_v=0.2)),
+                height=Bitmap(
+                    file=str(folder / "textures" / "dents.png"), uv_transform=((4.0, 0.0, 0.0), (0.0, 2.0, 0.0))
+                ),
+                scale=0.04,
+            ),
+            bowl,
         ),
         "twosided": (
             "a bowl that is metal outside and diffuse inside",
@@ -254,7 +296,7 @@ def material_balls(folder: Path) -> dict[str, Scene]:
 
 def _on_stage(folder: Path, what: str, bsdf: Bsdf, shape: Mesh | None) -> Scene:
     # The poles of a sphere lie on its Z axis: turned upright.
-    subject = shape or Sphere(radius=0.8, to_world=place(rotate=("x", -90.0), translate=(0.0, 0.8, 0.0)))
+    subject = copy.copy(shape) or Sphere(radius=0.8, to_world=place(rotate=("x", -90.0), translate=(0.0, 0.8, 0.0)))
     subject.name, subject.bsdf = "subject", bsdf
     return Scene(
         description=f"A material: {what}.",
@@ -306,6 +348,29 @@ def tiles() -> np.ndarray:
     border = (row % 16 < 2) | (column % 16 < 2)
     colour[border] = 0.15
     return np.rint(255 * colour).astype(np.uint8)
+
+
+def dents() -> np.ndarray:
+    """Heights of a hammered sheet, 64 x 64 8-bit pixels that repeat: what is deepest of round dents."""
+    size = 64
+    y, x = np.mgrid[0:size, 0:size] / size
+    depth = np.zeros((size, size))
+    for i, (u, v) in enumerate(np.random.default_rng(7).random((24, 2))):
+        radius = 0.12 + 0.05 * (i % 3)
+        dx, dy = ((a - b + 0.5) % 1.0 - 0.5 for a, b in ((x, u), (y, v)))
+        depth = np.maximum(depth, 1.0 - (dx**2 + dy**2) / radius**2)
+    return np.rint(255 * (1.0 - 0.8 * depth)).astype(np.uint8)
+
+
+def scales() -> np.ndarray:
+    """Normals of a round scale, 48 x 48 8-bit pixels that repeat; y is up where v, as rows, grows down."""
+    size = 48
+    y, x = np.mgrid[0:size, 0:size] / size * 2.0 - 1.0
+    r2 = x**2 + y**2
+    inside = (r2 < 0.81)[..., None]
+    bulge = np.stack([0.6 * x, -0.6 * y, np.sqrt(np.maximum(1.0 - 0.36 * r2, 0.0))], axis=-1)
+    normal = np.where(inside, bulge, (0.0, 0.0, 1.0))
+    return np.rint(255 * (0.5 + 0.5 * normal)).astype(np.uint8)
 
 
 def _bowl_profile() -> list[tuple[float, float]]:

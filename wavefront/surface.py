@@ -147,12 +147,16 @@ def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool, tangent
                     d1 = geometry.uvs[i1] - geometry.uvs[i0]
                     d2 = geometry.uvs[i2] - geometry.uvs[i0]
                     along_u, along_v, scale = uv_partials((v1 - v0) / extent, (v2 - v0) / extent, d1, d2)
+                    if geometry.shapes[geometry.shape_of[hit.primitive]].polar == 1:
+                        # dp/du of a disk goes away from its centre, where u is 0, not along the middle of the triangle;
+                        # and the length of dp/dv that a triangle has is that at the rim, where u is 1.
+                        u = hit.u * geometry.uvs[i0][0] + hit.v * geometry.uvs[i1][0] + b2 * geometry.uvs[i2][0]
+                        center = wp.where(geometry.uvs[i0][0] == 0.0, v0, wp.where(geometry.uvs[i1][0] == 0.0, v1, v2))
+                        if u > 0.0:
+                            along_u = (vertex.position - center) / (u * extent * scale)
+                        along_v *= u
                     vertex.tangent = tangent_along(vertex.shading_normal, along_u)
                     if wp.static(bumps):
-                        if geometry.shapes[geometry.shape_of[hit.primitive]].polar == 1:
-                            # The length of dp/dv that the triangles of a disk give is that at its rim, where u is 1.
-                            u = hit.u * geometry.uvs[i0][0] + hit.v * geometry.uvs[i1][0] + b2 * geometry.uvs[i2][0]
-                            along_v *= u
                         vertex.uv_jacobian = (extent * scale) * in_frame(vertex, along_u, along_v)
         if wp.static(spheres):
             if hit.primitive >= geometry.triangle_count:

@@ -135,8 +135,9 @@ def test_a_white_furnace_is_not_brighter_than_its_light(pair):
 
 def test_against_mitsuba():
     """What Mitsuba evaluates, for our samples too. What it samples has two errors where a part transmits (3.9): to the
-    probability of a mirrored direction it adds the density of the other part; and where a one-sided part is chosen that
-    is seen from its back, it goes on into a direction of that part, weighted as if the other part had chosen it."""
+    probability of a mirrored direction it adds the density of the other part; and where the part that is chosen rejects
+    its sample (it is seen from its back, or reflects to below the surface), the direction still counts, weighted as if
+    the other part had chosen it."""
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("scalar_rgb")
 

@@ -18,7 +18,7 @@ SPHERE = {"type": "sphere"}
 NAME_OR_BITMAP = "a list of 3 numbers >= 0 and <= 1, a name or an object of type 'bitmap' or 'checkerboard'"
 BSDF_TYPES = (
     "'diffuse', 'oren_nayar', 'conductor', 'rough_conductor', 'dielectric', 'rough_dielectric', 'thin_dielectric', "
-    "'plastic', 'rough_plastic', 'principled', 'null', 'twosided'"
+    "'plastic', 'rough_plastic', 'principled', 'null', 'blend', 'normal_map', 'bump_map', 'twosided'"
 )
 
 
@@ -299,6 +299,12 @@ def full_scene(folder):
             d.RoughDielectric(name="e", alpha=0.3),
             d.TwoSided(name="f", front="a", back=d.Diffuse(reflectance=0.25)),
             d.Mask(name="g", bsdf="f", opacity="checks"),
+            d.RoughConductor(name="h", material="Au", alpha_u=0.1, alpha_v="checks"),
+            d.BumpMap(
+                name="i", bsdf="h", height=d.Bitmap(file=str(folder / "t.exr")), scale=-0.5, flip_invalid_normals=False
+            ),
+            d.NormalMap(name="j", bsdf="e", normal=[0.5, 0.5, 1.0], shadowing=False),
+            d.Blend(name="k", first="a", second=d.Blend(first="c", second="d"), weight="checks"),
         ],
         emitters=[
             d.Envmap(

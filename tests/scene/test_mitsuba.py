@@ -198,6 +198,21 @@ def test_scalar_texture_is_linearised_as_mitsuba_does(mi, load_xml, xml_folder):
 
 # --- BSDFs, emitters and other defaults ------------------------------------------------------------------------
 
+
+def test_bump_maps_take_a_texture_of_any_name(load_xml, xml_folder):
+    """Encoded as it says; normals too."""
+    image = '<texture type="bitmap" name="{}"><string name="filename" value="colours.png"/>{}</texture>'
+    raw, file = '<boolean name="raw" value="true"/>', str(xml_folder / "colours.png")
+    body = (
+        f'<bsdf type="bumpmap"><float name="scale" value="-3"/>{image.format("map", raw)}<bsdf type="plastic"/></bsdf>'
+    )
+    expected = d.BumpMap(bsdf=d.Plastic(), height=d.Bitmap(file=file, color_space="linear"), scale=-3.0)
+    assert bsdf_of(load_xml(on_shape(body))) == expected
+    body = f'<bsdf type="normalmap">{image.format("normalmap", "")}<bsdf type="diffuse"/></bsdf>'
+    expected = d.NormalMap(bsdf=d.Diffuse(), normal=d.Bitmap(file=file, color_space="srgb"))
+    assert bsdf_of(load_xml(on_shape(body))) == expected
+
+
 BSDFS = [
     ('<bsdf type="diffuse"/>', d.Diffuse(reflectance=0.5)),
     (
@@ -222,6 +237,29 @@ BSDFS = [
     (
         '<bsdf type="dielectric"><string name="int_ior" value="water"/><float name="ext_ior" value="1"/></bsdf>',
         d.Dielectric(int_ior="water", ext_ior=1.0),
+    ),
+    (
+        '<bsdf type="roughconductor"><float name="alpha_u" value="0.2"/><float name="alpha_v" value="0.4"/>'
+        '<string name="material" value="Cu"/></bsdf>',
+        d.RoughConductor(material="Cu", alpha_u=0.2, alpha_v=0.4, distribution="beckmann"),
+    ),
+    (
+        '<bsdf type="roughdielectric"><float name="alpha_u" value="0.2"/><float name="alpha_v" value="0.2"/></bsdf>',
+        d.RoughDielectric(alpha=0.2, distribution="beckmann"),
+    ),
+    (
+        '<bsdf type="blendbsdf"><float name="weight" value="0.25"/><bsdf type="diffuse"/><bsdf type="plastic"/></bsdf>',
+        d.Blend(first=d.Diffuse(), second=d.Plastic(), weight=0.25),
+    ),
+    (
+        '<bsdf type="normalmap"><rgb name="normalmap" value="0.4, 0.5, 0.9"/><bsdf type="diffuse"/></bsdf>',
+        d.NormalMap(bsdf=d.Diffuse(), normal=[0.4, 0.5, 0.9]),
+    ),
+    (
+        '<bsdf type="normalmap"><rgb name="normalmap" value="0.4, 0.5, 0.9"/><bsdf type="diffuse"/>'
+        '<boolean name="flip_invalid_normals" value="false"/>'
+        '<boolean name="use_shadowing_function" value="false"/></bsdf>',
+        d.NormalMap(bsdf=d.Diffuse(), normal=[0.4, 0.5, 0.9], flip_invalid_normals=False, shadowing=False),
     ),
     ('<bsdf type="roughdielectric"/>', d.RoughDielectric(distribution="beckmann")),
     ('<bsdf type="roughdielectric"><float name="alpha" value="0"/></bsdf>', d.Dielectric()),

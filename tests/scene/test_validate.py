@@ -20,6 +20,8 @@ REFLECTING = (
     "diffuse, oren_nayar, conductor, rough_conductor, plastic, rough_plastic, principled, a blend of those, and a "
     "normal_map or bump_map around one"
 )
+FLAT = d.NormalMap(bsdf=d.Diffuse(), normal=[0.5, 0.5, 1.0])
+GLASSY = d.Blend(name="b", first=d.Plastic(), second=d.Dielectric())
 TOO_LARGE = "expected a number of at most 3.403e+38, as 32-bit floats are; found"
 
 
@@ -87,6 +89,58 @@ def moved(*transform, shape=d.Rectangle):
         (
             with_bsdfs(d.TwoSided(name="t", front=d.TwoSided(front=d.Diffuse()))),
             f"bsdfs[0].front: a twosided BSDF cannot hold twosided; allowed: {REFLECTING}",
+        ),
+        (
+            with_bsdfs(d.Blend(first=d.Diffuse(), second=d.Mask(bsdf=d.Diffuse()))),
+            "bsdfs[0].second: a blend cannot hold mask; put the mask around the blend",
+        ),
+        (
+            with_bsdfs(d.Blend(first=FLAT, second=d.Diffuse())),
+            "bsdfs[0].first: a blend cannot hold normal_map; put the normal_map around the blend",
+        ),
+        (
+            with_bsdfs(d.TwoSided(front=d.Blend(first=d.Diffuse(), second="b")), GLASSY),
+            f"bsdfs[0].front: a twosided BSDF cannot hold a blend with dielectric; allowed: {REFLECTING}",
+        ),
+        (
+            with_bsdfs(d.TwoSided(front=d.NormalMap(bsdf=d.Null(), normal=[0.5, 0.5, 1.0]))),
+            f"bsdfs[0].front.bsdf: a twosided BSDF cannot hold null; allowed: {REFLECTING}",
+        ),
+        (
+            with_bsdfs(d.Blend(first="a", second=d.Diffuse(), name="a")),
+            "bsdfs[0].first: BSDFs refer to each other in a cycle: 'a' -> 'a'",
+        ),
+        (
+            with_bsdfs(d.NormalMap(bsdf=FLAT, normal=[0.5, 0.5, 1.0])),
+            "bsdfs[0].bsdf: a normal_map cannot hold normal_map",
+        ),
+        (
+            with_bsdfs(d.BumpMap(bsdf=d.Mask(bsdf=d.Diffuse()), height=d.Bitmap(file=TILES))),
+            "bsdfs[0].bsdf: a bump_map cannot hold mask; put the bump_map into the mask",
+        ),
+        (
+            with_bsdfs(d.BumpMap(bsdf=d.Null(), height=d.Bitmap(file=TILES))),
+            "bsdfs[0].bsdf: a bump_map cannot hold null, which has no normal",
+        ),
+        (
+            with_bsdfs(d.NormalMap(bsdf=d.TwoSided(front=d.Diffuse(), back=FLAT), normal=[0.5, 0.5, 1.0])),
+            "bsdfs[0].bsdf.back: a normal_map cannot hold normal_map",
+        ),
+        (
+            with_bsdfs(d.BumpMap(bsdf=d.Diffuse(), height=d.Bitmap(file=TILES, filter="nearest"))),
+            "bsdfs[0].height: expected a bitmap with the filter 'bilinear', which has slopes; found filter 'nearest'",
+        ),
+        (
+            d.Scene(bsdfs=[d.BumpMap(bsdf=d.Diffuse(), height="c")], textures=[d.Checkerboard(name="c")]),
+            "bsdfs[0].height: expected a bitmap with the filter 'bilinear', which has slopes; found a checkerboard",
+        ),
+        (
+            with_bsdfs(d.RoughConductor(material="Au", alpha_u=0.1)),
+            "bsdfs[0]: a rough surface has alpha, or alpha_u and alpha_v; found alpha_u",
+        ),
+        (
+            with_bsdfs(d.RoughDielectric(alpha=0.1, alpha_u=0.1, alpha_v=0.1)),
+            "bsdfs[0]: a rough surface has alpha, or alpha_u and alpha_v; found alpha and alpha_u and alpha_v",
         ),
         (
             d.Scene(shapes=[d.Cube(bsdf=d.Mask(bsdf=d.Mask(bsdf=d.Diffuse())))]),
@@ -297,6 +351,13 @@ def test_a_rotation_without_an_axis_is_refused():
         with_bsdfs(d.TwoSided(front=d.OrenNayar(roughness=d.Checkerboard(color0=0.0, color1=1.0)))),
         with_bsdfs(
             d.TwoSided(front=d.Plastic(int_ior="water"), back=d.RoughPlastic(diffuse_reflectance=[1.0, 0.0, 0.5]))
+        ),
+        with_bsdfs(
+            d.Mask(bsdf=d.NormalMap(bsdf=d.TwoSided(front=GLASSY.first, back="b"), normal=[0.5, 0.5, 1.0])),
+            d.Blend(name="b", first=d.Conductor(material="Au"), second=d.Blend(first=d.Diffuse(), second=d.Plastic())),
+            d.TwoSided(front=FLAT, back=d.BumpMap(bsdf="b", height=d.Bitmap(file=TILES), scale=-1.0)),
+            d.BumpMap(bsdf=GLASSY.second, height=d.Bitmap(file=TILES), shadowing=False),
+            d.Blend(first=d.Null(), second=d.RoughDielectric(alpha_u=0.1, alpha_v=d.Checkerboard())),
         ),
         with_bsdfs(d.Mask(bsdf=d.RoughDielectric()), d.Mask(bsdf=d.TwoSided(front=d.Diffuse()))),
         moved(STEP(scale=1e-6), STEP(scale=(1.0, 1e6, 1.0))),

@@ -292,7 +292,10 @@ class NormalMap(Record, tag_field="type", tag="normal_map"):
     bsdf: Annotated[str | Bsdf, Meta(description="Name of a BSDF, or a BSDF; no mask, null or other map.")]
     normal: Annotated[
         RGBFraction | str | Bitmap | Checkerboard,
-        Meta(description="(x, y, z) of the normal scaled to [0, 1]; x is along growing u. 8-bit images are linear."),
+        Meta(
+            description="(x, y, z) of the normal scaled to [0, 1], as in glTF: x is along growing u, y up in the "
+            "image. 8-bit images are linear."
+        ),
     ]
     name: str = ""
     flip_invalid_normals: Annotated[

@@ -216,7 +216,9 @@ class Materials:
         if directions:
             if plugin.has("alpha"):
                 raise plugin.error("alpha excludes alpha_u and alpha_v")
-            fields = {name: self.scalar(plugin, name, 0.1) for name in ("alpha_u", "alpha_v")}
+            if len(directions) == 1:
+                raise plugin.error("alpha_u and alpha_v must be given together")
+            fields = {name: self.scalar(plugin, name, 0.1) for name in directions}
             if fields["alpha_u"] == fields["alpha_v"]:
                 fields = {"alpha": fields["alpha_u"]}
         else:
@@ -278,12 +280,13 @@ class Materials:
 
     def _bump_map(self, plugin):
         """Its texture may have any name."""
-        textures = plugin.objects("texture")
+        given = [(name, child) for name, child in plugin.resolved() if child.tag == "texture"]
+        plugin.known.update(name for name, _ in given)
         scale = plugin.number("scale", 1.0)
         fields = self._map_fields(plugin)
-        if len(textures) != 1:
-            raise plugin.error(f"{plugin.label()} needs one texture; found {len(textures)}")
-        height = self._texture(textures[0], True, None)
+        if len(given) != 1:
+            raise plugin.error(f"{plugin.label()} needs one texture; found {len(given)}")
+        height = self._texture(given[0][1], True, None)
         if not isinstance(height, description.Bitmap):
             raise plugin.error(f"{plugin.label()} needs a bitmap")
         return description.BumpMap(height=height, scale=scale, **fields)

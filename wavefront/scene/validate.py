@@ -203,7 +203,7 @@ def _check_height(bsdf, path, scene):
     named = {texture.name: texture for texture in scene.textures}
     height = named.get(bsdf.height) if isinstance(bsdf.height, str) else bsdf.height
     if isinstance(height, description.Checkerboard) or getattr(height, "filter", "") == "nearest":
-        found = "a checkerboard" if isinstance(height, description.Checkerboard) else "the filter 'nearest'"
+        found = "a checkerboard" if isinstance(height, description.Checkerboard) else "filter 'nearest'"
         _fail(f"{path}.height", f"expected a bitmap with the filter 'bilinear', which has slopes; found {found}")
 
 
