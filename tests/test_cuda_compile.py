@@ -14,6 +14,7 @@ from wavefront.integrator import make_kernels
 CORNELL_BOX = Features(
     triangles=True,
     spheres=False,
+    instances=(),
     smooth=False,
     uvs=False,
     bsdfs=("diffuse",),
@@ -31,6 +32,7 @@ CORNELL_BOX = Features(
 EVERYTHING = Features(
     triangles=True,
     spheres=True,
+    instances=("spheres", "triangles"),
     smooth=True,
     uvs=True,
     bsdfs=tuple(sorted(KINDS)),
@@ -47,8 +49,9 @@ EVERYTHING = Features(
 )
 CHANGES = [
     {},
-    {"triangles": False, "lights": ("sphere",)},
-    {"spheres": False, "lights": ("triangle",)},
+    {"triangles": False, "lights": ("sphere",), "instances": ("spheres",)},
+    {"spheres": False, "lights": ("triangle",), "instances": ("triangles",)},
+    {"instances": ()},
     {"textures": (), "light_textures": (), "uvs": False, "lights": ("constant",)},
     {"lights": ("envmap_floats", "triangle")},
     {"lights": ("envmap_bytes",)},

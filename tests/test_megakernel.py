@@ -61,7 +61,14 @@ def test_filters(filter_name):
     check(scene)
 
 
-DEFAULT = ["glossy-plates", "glass-caustic", "material-mask", "material-diffuse-bitmap", "material-twosided", "coloured-glass"]
+DEFAULT = [
+    "glossy-plates",
+    "glass-caustic",
+    "material-mask",
+    "material-diffuse-bitmap",
+    "material-twosided",
+    "coloured-glass",
+]
 OTHERS = sorted(p.stem for p in SCENES.glob("*.json") if p.stem not in [*DEFAULT, "cornell-box"])
 
 

@@ -46,8 +46,9 @@ def make_features(scene: description.Scene, device_scene: DeviceScene) -> Featur
     """What the kernels for a scene and its settings must do, and no more."""
     integrator = scene.integrator
     return Features(
-        triangles=device_scene.triangle_count > 0,
-        spheres=device_scene.sphere_count > 0,
+        triangles=bool(device_scene.geometry.mesh),
+        spheres=bool(device_scene.geometry.sphere_bvh),
+        instances=device_scene.instances,
         smooth=device_scene.smooth,
         uvs=bool(device_scene.texture_kinds),
         bsdfs=device_scene.bsdfs,
@@ -90,7 +91,7 @@ def make_kernels(f: Features) -> Kernels:
     return Kernels(
         generate=make_generate(f.filter, f.transmission),
         intersect=make_intersect(
-            f.triangles, f.spheres, f.smooth, f.uvs, f.area_lights, bool(f.escape_lights), f.media
+            f.triangles, f.spheres, f.smooth, f.uvs, f.area_lights, bool(f.escape_lights), f.media, f.instances
         ),
         escaped=make_escaped(f.escape_lights, f.light_sampling) if f.escape_lights else None,
         emission=make_emission(f.lights, f.light_textures, f.light_sampling) if f.area_lights else None,
@@ -98,7 +99,7 @@ def make_kernels(f: Features) -> Kernels:
         direct=make_direct(f.bsdfs, f.mask, f.textures, f.lights, f.light_textures, f.uvs, f.media)
         if f.light_sampling
         else None,
-        shadow=make_shadow(f.triangles, f.spheres) if f.light_sampling else None,
+        shadow=make_shadow(f.triangles, f.spheres, f.instances) if f.light_sampling else None,
         drain=drain_rays,
         scatter=make_scatter(f.bsdfs, f.mask, f.textures, f.uvs, f.transmission, f.roulette, f.media),
         advance=advance_bounce,

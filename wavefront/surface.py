@@ -1,12 +1,12 @@
 """From a hit to the vertex of a path: position, normals, UV, and how far a new ray must start from it."""
 
-from __future__ import annotations
-
+# Annotations are evaluated at once, for the type of a hit depends on whether there are instances.
 import functools
 
 import warp as wp
 
-from wavefront.accel.mesh_query import Geometry, Hit
+from wavefront.accel.instance import normal_to_world, offset_to_world, point_to_local, point_to_world
+from wavefront.accel.mesh_query import Geometry, hit_type
 
 # Roundings in an interpolated position and in a ray-triangle test, in units of float32's 2^-24: a handful each (Higham
 # 2002, section 3.1), doubled to be safe.
@@ -66,7 +66,7 @@ def sphere_uv(normal: wp.vec3) -> wp.vec2:
 
 
 @functools.cache
-def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
+def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool, instances: tuple[str, ...] = ()):
     """`make_vertex(geometry, origin, direction, hit) -> Vertex` for a hit that exists.
 
     Args:
@@ -74,10 +74,15 @@ def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
         spheres: The scene has spheres.
         smooth: Some mesh has vertex normals.
         uvs: Some texture is looked up.
+        instances: Kinds of primitive in groups, as of `make_intersector`.
     """
+    AnyHit = hit_type(instances)
+    triangles = triangles or "triangles" in instances
+    spheres = spheres or "spheres" in instances
+    instanced = bool(instances)
 
     @wp.func
-    def vertex_of(geometry: Geometry, origin: wp.vec3, direction: wp.vec3, hit: Hit) -> Vertex:
+    def vertex_of(geometry: Geometry, origin: wp.vec3, direction: wp.vec3, hit: AnyHit) -> Vertex:
         vertex = Vertex()
         if wp.static(triangles):
             if hit.primitive < geometry.triangle_count:
@@ -90,16 +95,31 @@ def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
                 b2 = 1.0 - hit.u - hit.v
                 vertex.position = hit.u * v0 + hit.v * v1 + b2 * v2
                 normal = wp.normalize(scaled_cross(v0, v1, v2, triangle_extent(v0, v1, v2)))
+                vertex.offset = position_error(v0, v1, v2, hit.u, hit.v, normal)
+                if wp.static(instanced):
+                    if hit.instance >= 0:
+                        instance = geometry.instances[hit.instance]
+                        reach = wp.abs(vertex.position) + wp.max(wp.abs(v1 - v0), wp.abs(v2 - v0))
+                        vertex.offset = offset_to_world(instance, vertex.offset, reach, normal, POSITION_ERROR)
+                        vertex.position = point_to_world(instance, vertex.position)
+                        normal = normal_to_world(instance, normal)
                 vertex.shading_normal = normal
                 if wp.static(smooth):
                     if geometry.shapes[geometry.shape_of[hit.primitive]].smooth == 1:
-                        blend = hit.u * geometry.normals[i0] + hit.v * geometry.normals[i1] + b2 * geometry.normals[i2]
+                        n0 = geometry.normals[i0]
+                        n1 = geometry.normals[i1]
+                        n2 = geometry.normals[i2]
+                        if wp.static(instanced):
+                            if hit.instance >= 0:  # each is of unit length again, as if the mesh were in the world
+                                n0 = normal_to_world(instance, n0)
+                                n1 = normal_to_world(instance, n1)
+                                n2 = normal_to_world(instance, n2)
+                        blend = hit.u * n0 + hit.v * n1 + b2 * n2
                         if wp.length_sq(blend) > 0.0:
                             vertex.shading_normal = wp.normalize(blend)
                             if wp.dot(vertex.shading_normal, normal) < 0.0:
                                 normal = -normal
                 vertex.geometric_normal = normal
-                vertex.offset = position_error(v0, v1, v2, hit.u, hit.v, normal)
                 if wp.static(uvs):
                     vertex.uv = hit.u * geometry.uvs[i0] + hit.v * geometry.uvs[i1] + b2 * geometry.uvs[i2]
         if wp.static(spheres):
@@ -107,7 +127,12 @@ def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
                 index = hit.primitive - geometry.triangle_count
                 sphere = geometry.spheres[index]
                 center = wp.vec3(sphere[0], sphere[1], sphere[2])
-                outwards = wp.normalize(origin + hit.t * direction - center)
+                reached = origin + hit.t * direction
+                if wp.static(instanced):
+                    if hit.instance >= 0:
+                        moved = geometry.instances[hit.instance]
+                        reached = point_to_local(moved, origin) + hit.t * (moved.to_local * direction)
+                outwards = wp.normalize(reached - center)
                 vertex.position = center + sphere[3] * outwards
                 vertex.geometric_normal = outwards
                 if geometry.shapes[geometry.shape_of[hit.primitive]].flip == 1:
@@ -117,6 +142,13 @@ def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool):
                 vertex.offset = SPHERE_ERROR * (wp.dot(wp.abs(center), wp.abs(outwards)) + sphere[3])
                 if wp.static(uvs):
                     vertex.uv = sphere_uv(geometry.sphere_to_local[index] * outwards)
+                if wp.static(instanced):
+                    if hit.instance >= 0:
+                        reach = wp.abs(vertex.position) + wp.vec3(sphere[3])
+                        vertex.offset = offset_to_world(moved, vertex.offset, reach, outwards, POSITION_ERROR)
+                        vertex.position = point_to_world(moved, vertex.position)
+                        vertex.geometric_normal = normal_to_world(moved, vertex.geometric_normal)
+                        vertex.shading_normal = vertex.geometric_normal
         return vertex
 
     return vertex_of

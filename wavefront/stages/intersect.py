@@ -21,10 +21,11 @@ def make_intersect(
     area_lights: bool,
     escape_lights: bool,
     media: bool = False,
+    instances: tuple[str, ...] = (),
 ):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name (or whether there are any)."""
-    closest_hit, _ = make_intersector(triangles, spheres)
-    vertex_of = make_vertex(triangles, spheres, smooth, uvs)
+    closest_hit, _ = make_intersector(triangles, spheres, instances)
+    vertex_of = make_vertex(triangles, spheres, smooth, uvs, instances)
 
     @wp.kernel(enable_backward=False, module="unique")
     def closest_hits(
