@@ -51,7 +51,7 @@ def _write_meshes(scene, folder, final):
     """Writes every mesh that comes from a file as PLY in its own space; shapes that share a file share the PLY."""
     written: dict[tuple, tuple[Path, bool]] = {}
     taken: set[str] = set()
-    for i, shape in enumerate(scene.shapes):
+    for where, shape in walk(scene):
         if not isinstance(shape, description.Mesh) or shape.file is None:
             continue
         key = (shape.file, shape.face_normals, shape.flip_v)
@@ -59,7 +59,7 @@ def _write_meshes(scene, folder, final):
             folder.mkdir(exist_ok=True)
             name = _free_name(Path(shape.file).stem, ".ply", taken)
             plain = description.Mesh(file=shape.file, face_normals=shape.face_normals, flip_v=shape.flip_v)
-            mesh = meshes.tessellate(plain, f"shapes[{i}]")
+            mesh = meshes.tessellate(plain, where)
             meshes.write_ply(folder / name, mesh)
             written[key] = final / name, mesh.normals is not None
         path, has_normals = written[key]
