@@ -23,8 +23,8 @@ STEPS = [
     '<scale x="-0.5" y="0.5" z="0.5"/><translate x="0.2" y="0.6" z="-0.3"/>',
     '<scale x="0.3" y="0.9" z="0.5"/><rotate z="1" angle="-35"/><translate x="1.2" y="0.9"/>',
 ]
-# Different scales along the axes: Mitsuba interpolates the normals of a smooth mesh in the group's space, ours are those
-# of a mesh in the world, so there it has none.
+# Different scales along the axes: Mitsuba interpolates normals of a smooth mesh in the space of the group; ours are
+# those of a mesh in the world. So there it has none.
 FLAT = GROUP.replace('"toy"', '"flat"').replace('.obj"/>', '.obj"/><boolean name="face_normals" value="true"/>')
 INSTANCES = "\n  ".join(
     f'<shape type="instance"><ref id="{group}"/><transform name="to_world">{steps}</transform></shape>'

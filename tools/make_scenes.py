@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from tools import door_scene, glass_scenes, light_scenes
+from tools import door_scene, glass_scenes, instance_scenes, light_scenes
 from tools.scene_parts import box, film, look_at, place, rectangle, revolve, write_ply
 from wavefront.scene import json_format
 from wavefront.scene.description import (
@@ -72,6 +72,7 @@ def write(folder: Path) -> list[str]:
         "glass-caustic.json": glass_caustic(),
         "coloured-glass.json": glass_scenes.coloured_glass(),
         "door-ajar.json": door_scene.door_ajar(folder),
+        "instances.json": instance_scenes.spiral(folder),
         "include/material-stage.json": material_stage(),
         **{f"light-{name}.json": scene for name, scene in light_scenes.scenes(folder).items()},
         **{f"material-{name}.json": scene for name, scene in material_balls(folder).items()},
