@@ -4,7 +4,8 @@ What the records cannot say is an error that names the element and its line; wha
 or is left out. Where the dialects differ in meaning, Mitsuba 3.9 decides: it is what images are compared with.
 
 Choices: unlimited `max_depth` (-1) becomes 1000. Integrators that compute the same image another way (bdpt, sppm, ...)
-become `path` with a warning, and `direct` becomes `path` of depth 2. Media absorb whatever the integrator. Filters that the records lack become a Gaussian.
+become `path` with a warning, and `direct` becomes `path` of depth 2. Filters that the records lack become a Gaussian.
+Media absorb whatever the integrator.
 """
 
 from __future__ import annotations
