@@ -64,11 +64,20 @@ def absorbed(sigma_a: wp.array[wp.vec3], medium: int, distance: float) -> wp.vec
 
 
 @functools.cache
-def make_megakernel(triangles: bool, spheres: bool, smooth: bool, uvs: bool, tangents: bool, maps: bool, nee: bool):
+def make_megakernel(
+    triangles: bool,
+    spheres: bool,
+    smooth: bool,
+    uvs: bool,
+    tangents: bool,
+    maps: bool,
+    nee: bool,
+    instances: tuple[str, ...],
+):
     """Only what a scene lacks memory for is left out: kinds of primitive, vertex normals, UVs, tables of sampling."""
     perspective, thin_lens, orthographic = (make_camera_ray(kind) for kind in CAMERAS)
-    closest_hit, occluded = make_intersector(triangles, spheres)
-    vertex_of = make_vertex(triangles, spheres, smooth, uvs, tangents, maps)
+    closest_hit, occluded = make_intersector(triangles, spheres, instances)
+    vertex_of = make_vertex(triangles, spheres, smooth, uvs, tangents, maps, instances)
     eval_bsdf, sample_bsdf, _ = make_bsdf(tuple(sorted(BSDF_KINDS)), True, TEXTURES, tangents, maps)
     mapped_frame = make_mapped_frame(TEXTURES, True)
     sample_light, light_pdf = make_light_sampler(LIGHTS, TEXTURES)
@@ -232,7 +241,7 @@ def render_megakernel(renderer: Renderer, spp: int) -> np.ndarray:
     settings.seed = renderer.seed
     n = film.width * film.height * spp
     result = wp.zeros(n, dtype=wp.vec3, device="cpu")
-    kernel = make_megakernel(f.triangles, f.spheres, f.smooth, f.uvs, f.tangents, bool(f.maps), f.nee)
+    kernel = make_megakernel(f.triangles, f.spheres, f.smooth, f.uvs, f.tangents, bool(f.maps), f.nee, f.instances)
     d = device_scene
     inputs = [make_camera(scene.camera, film), d.geometry, d.materials, d.textures, d.lights, settings]
     wp.launch(kernel, dim=n, inputs=inputs, outputs=[result], device="cpu")

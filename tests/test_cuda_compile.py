@@ -16,6 +16,7 @@ from wavefront.stages.inspect import make_inspect_hit, make_inspect_light
 CORNELL_BOX = Features(
     triangles=True,
     spheres=False,
+    instances=(),
     smooth=False,
     uvs=False,
     tangents=False,
@@ -36,6 +37,7 @@ CORNELL_BOX = Features(
 EVERYTHING = Features(
     triangles=True,
     spheres=True,
+    instances=("spheres", "triangles"),
     smooth=True,
     uvs=True,
     tangents=True,
@@ -55,8 +57,9 @@ EVERYTHING = Features(
 )
 CHANGES = [
     {},
-    {"triangles": False, "lights": ("sphere",)},
-    {"spheres": False, "lights": ("triangle",)},
+    {"triangles": False, "lights": ("sphere",), "instances": ("spheres",)},
+    {"spheres": False, "lights": ("triangle",), "instances": ("triangles",)},
+    {"instances": ()},
     {"textures": (), "light_textures": (), "uvs": False, "lights": ("constant",)},
     {"lights": ("envmap_floats", "triangle")},
     {"lights": ("envmap_bytes",), "light_textures": ("halves",)},

@@ -54,7 +54,7 @@ def _write_meshes(scene, folder, final):
     share the PLY."""
     written: dict[tuple, tuple[Path, bool]] = {}
     taken: set[str] = set()
-    for i, shape in enumerate(scene.shapes):
+    for where, shape in walk(scene):
         if not isinstance(shape, description.Mesh) or shape.file is None:
             continue
         key = (shape.file, repr(shape.part), shape.face_normals, shape.flip_v)
@@ -64,7 +64,7 @@ def _write_meshes(scene, folder, final):
             plain = description.Mesh(
                 file=shape.file, part=shape.part, face_normals=shape.face_normals, flip_v=shape.flip_v
             )
-            mesh = meshes.own_space(plain, f"shapes[{i}]")
+            mesh = meshes.own_space(plain, where)
             meshes.write_ply(folder / name, mesh)
             written[key] = final / name, mesh.normals is not None
         path, has_normals = written[key]

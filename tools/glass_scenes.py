@@ -22,7 +22,7 @@ def coloured_glass() -> Scene:
     return Scene(
         description="A ball of green glass, a block of red glass and a block of smoke around a ball: absorption grows "
         "with the way through, so thick parts are dark and saturated.",
-        camera=Perspective(fov=36.0, to_world=look_at((0, 1.7, 4.6), (0, 0.55, 0))),
+        camera=Perspective(fov=42.0, to_world=look_at((0, 1.7, 4.6), (0, 0.55, 0))),
         film=film(),
         integrator=PathIntegrator(max_depth=16),
         bsdfs=[

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from tools import camera_scenes, door_scene, glass_scenes, gltf_scene, light_scenes
+from tools import camera_scenes, door_scene, glass_scenes, gltf_scene, instance_scenes, light_scenes
 from tools.scene_parts import box, film, look_at, place, rectangle, revolve, write_ply
 from wavefront.scene import json_format
 from wavefront.scene.description import (
@@ -83,6 +83,7 @@ def write(folder: Path) -> list[str]:
         "coloured-glass.json": glass_scenes.coloured_glass(),
         "door-ajar.json": door_scene.door_ajar(folder),
         "principled-lobes.json": principled_lobes(folder),
+        "instances.json": instance_scenes.spiral(folder),
         "include/material-stage.json": material_stage(),
         **{f"camera-{name}.json": scene for name, scene in camera_scenes.scenes().items()},
         **{f"light-{name}.json": scene for name, scene in light_scenes.scenes(folder).items()},

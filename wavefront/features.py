@@ -16,6 +16,7 @@ class Features:
     # Geometry
     triangles: bool  # some shape is a mesh
     spheres: bool
+    instances: tuple[str, ...]  # kinds of primitive in groups that have instances, sorted; empty without instances
     smooth: bool  # some mesh has vertex normals
     uvs: bool  # some texture is looked up, or UVs are asked for
     tangents: bool  # some BSDF depends on the direction of its tangent

@@ -47,8 +47,9 @@ def make_features(scene: description.Scene, device_scene: DeviceScene) -> Featur
     """What the kernels for a scene and its settings must do, and no more."""
     integrator = scene.integrator
     return Features(
-        triangles=device_scene.triangle_count > 0,
-        spheres=device_scene.sphere_count > 0,
+        triangles=bool(device_scene.geometry.mesh),
+        spheres=bool(device_scene.geometry.sphere_bvh),
+        instances=device_scene.instances,
         smooth=device_scene.smooth,
         uvs=bool(device_scene.texture_kinds) or "uv" in scene.film.aovs,
         tangents=device_scene.tangents,
@@ -105,6 +106,7 @@ def make_kernels(f: Features) -> Kernels:
             bool(f.escape_lights),
             "shape_index" in f.aovs,
             f.media,
+            f.instances,
         ),
         perturb=make_perturb(f.textures, f.uvs, "bump" in f.maps) if f.maps else None,
         escaped=make_escaped(f.escape_lights, f.light_sampling) if f.escape_lights else None,
@@ -113,7 +115,7 @@ def make_kernels(f: Features) -> Kernels:
         direct=make_direct(f.bsdfs, f.mask, f.textures, f.lights, f.light_textures, f.uvs, f.tangents, f.maps, f.media)
         if f.light_sampling
         else None,
-        shadow=make_shadow(f.triangles, f.spheres) if f.light_sampling else None,
+        shadow=make_shadow(f.triangles, f.spheres, f.instances) if f.light_sampling else None,
         drain=drain_rays,
         scatter=make_scatter(
             f.bsdfs, f.mask, f.textures, f.uvs, f.tangents, f.maps, f.transmission, f.roulette, f.media

@@ -149,6 +149,8 @@ def describe_render(renderer: Renderer, source: str, started: float) -> dict:
         "mrays_per_second": (s.rays + s.shadow_rays) / seconds / 1e6,
         "nonfinite": s.nonfinite,
         "triangles": renderer.device_scene.triangle_count,
+        "triangles_with_instances": renderer.device_scene.instanced_triangle_count,
+        "instances": renderer.device_scene.instance_count,
         "spheres": renderer.device_scene.sphere_count,
         "lights": renderer.device_scene.light_count,
         "bytes_per_pixel": renderer.bytes_per_pixel,

@@ -47,8 +47,10 @@ def find_nonfinite(renderer, first_sample: int, sample_count: int) -> NonFiniteE
 
         pixel = first_pixel(found, renderer.film.width, renderer.film.height, worker.capacity)
         if pixel is not None:
-            stages = TraceWorker(renderer).trace(*pixel, sample).left_out
-            return NonFiniteError(stages[0], *pixel, sample, renderer.seed)
+            window = renderer.scene.film.window
+            x, y = pixel[0] + window.x, pixel[1] + window.y
+            stages = TraceWorker(renderer).trace(x, y, sample).left_out
+            return NonFiniteError(stages[0], x, y, sample, renderer.seed)
     raise AssertionError("a contribution that is not finite was counted, but no path makes one")
 
 

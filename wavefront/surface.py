@@ -1,12 +1,12 @@
 """From a hit to the vertex of a path: position, normals, UV, and how far a new ray must start from it."""
 
-from __future__ import annotations
-
+# Annotations are evaluated at once, for the type of a hit depends on whether there are instances.
 import functools
 
 import warp as wp
 
-from wavefront.accel.mesh_query import Geometry, Hit
+from wavefront.accel.instance import normal_to_world, offset_to_world, point_to_local, point_to_world
+from wavefront.accel.mesh_query import Geometry, hit_type
 from wavefront.warp_samples import orthonormal_basis
 
 # Roundings in an interpolated position and in a ray-triangle test, in units of float32's 2^-24: a handful each (Higham
@@ -104,7 +104,15 @@ def in_frame(vertex: Vertex, along_u: wp.vec3, along_v: wp.vec3) -> wp.vec3:
 
 
 @functools.cache
-def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool, tangents: bool, bumps: bool):
+def make_vertex(
+    triangles: bool,
+    spheres: bool,
+    smooth: bool,
+    uvs: bool,
+    tangents: bool,
+    bumps: bool,
+    instances: tuple[str, ...] = (),
+):
     """`make_vertex(geometry, origin, direction, hit) -> Vertex` for a hit that exists.
 
     Args:
@@ -114,10 +122,15 @@ def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool, tangent
         uvs: Something reads UVs.
         tangents: Some BSDF or map depends on the direction of the tangent.
         bumps: There are bump maps, for which dp/du and dp/dv are needed.
+        instances: Kinds of primitive in groups, as of `make_intersector`.
     """
+    AnyHit = hit_type(instances)
+    triangles = triangles or "triangles" in instances
+    spheres = spheres or "spheres" in instances
+    instanced = bool(instances)
 
     @wp.func
-    def vertex_of(geometry: Geometry, origin: wp.vec3, direction: wp.vec3, hit: Hit) -> Vertex:
+    def vertex_of(geometry: Geometry, origin: wp.vec3, direction: wp.vec3, hit: AnyHit) -> Vertex:
         vertex = Vertex()
         if wp.static(triangles):
             if hit.primitive < geometry.triangle_count:
@@ -130,30 +143,55 @@ def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool, tangent
                 b2 = 1.0 - hit.u - hit.v
                 vertex.position = hit.u * v0 + hit.v * v1 + b2 * v2
                 normal = wp.normalize(scaled_cross(v0, v1, v2, triangle_extent(v0, v1, v2)))
+                vertex.offset = position_error(v0, v1, v2, hit.u, hit.v, normal)
+                if wp.static(instanced):
+                    if hit.instance >= 0:
+                        instance = geometry.instances[hit.instance]
+                        reach = wp.abs(vertex.position) + wp.max(wp.abs(v1 - v0), wp.abs(v2 - v0))
+                        vertex.offset = offset_to_world(instance, vertex.offset, reach, normal, POSITION_ERROR)
+                        vertex.position = point_to_world(instance, vertex.position)
+                        normal = normal_to_world(instance, normal)
                 vertex.shading_normal = normal
                 if wp.static(smooth):
                     if geometry.shapes[geometry.shape_of[hit.primitive]].smooth == 1:
-                        blend = hit.u * geometry.normals[i0] + hit.v * geometry.normals[i1] + b2 * geometry.normals[i2]
+                        n0 = geometry.normals[i0]
+                        n1 = geometry.normals[i1]
+                        n2 = geometry.normals[i2]
+                        if wp.static(instanced):
+                            if hit.instance >= 0:  # each is of unit length again, as if the mesh were in the world
+                                n0 = normal_to_world(instance, n0)
+                                n1 = normal_to_world(instance, n1)
+                                n2 = normal_to_world(instance, n2)
+                        blend = hit.u * n0 + hit.v * n1 + b2 * n2
                         if wp.length_sq(blend) > 0.0:
                             vertex.shading_normal = wp.normalize(blend)
                             if wp.dot(vertex.shading_normal, normal) < 0.0:
                                 normal = -normal
                 vertex.geometric_normal = normal
-                vertex.offset = position_error(v0, v1, v2, hit.u, hit.v, normal)
                 if wp.static(uvs):
                     vertex.uv = hit.u * geometry.uvs[i0] + hit.v * geometry.uvs[i1] + b2 * geometry.uvs[i2]
                 if wp.static(tangents):
-                    extent = triangle_extent(v0, v1, v2)
+                    e1 = v1 - v0
+                    e2 = v2 - v0
+                    # A disk is a fan, of which the vertex where u is 0 is the centre.
+                    outwards_u = hit.v * e1 + b2 * e2
+                    if geometry.uvs[i0][0] != 0.0:
+                        outwards_u -= wp.where(geometry.uvs[i1][0] == 0.0, e1, e2)
+                    if wp.static(instanced):
+                        if hit.instance >= 0:
+                            e1 = instance.to_world * e1
+                            e2 = instance.to_world * e2
+                            outwards_u = instance.to_world * outwards_u
+                    extent = wp.max(wp.max(wp.abs(e1)), wp.max(wp.abs(e2)))
                     d1 = geometry.uvs[i1] - geometry.uvs[i0]
                     d2 = geometry.uvs[i2] - geometry.uvs[i0]
-                    along_u, along_v, scale = uv_partials((v1 - v0) / extent, (v2 - v0) / extent, d1, d2)
+                    along_u, along_v, scale = uv_partials(e1 / extent, e2 / extent, d1, d2)
                     if geometry.shapes[geometry.shape_of[hit.primitive]].polar == 1:
                         # dp/du of a disk goes away from its centre, where u is 0, not along the middle of the triangle;
                         # and the length of dp/dv that a triangle has is that at the rim, where u is 1.
                         u = hit.u * geometry.uvs[i0][0] + hit.v * geometry.uvs[i1][0] + b2 * geometry.uvs[i2][0]
-                        center = wp.where(geometry.uvs[i0][0] == 0.0, v0, wp.where(geometry.uvs[i1][0] == 0.0, v1, v2))
                         if u > 0.0:
-                            along_u = (vertex.position - center) / (u * extent * scale)
+                            along_u = outwards_u / (u * extent * scale)
                         along_v *= u
                     vertex.tangent = tangent_along(vertex.shading_normal, along_u)
                     if wp.static(bumps):
@@ -163,7 +201,12 @@ def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool, tangent
                 index = hit.primitive - geometry.triangle_count
                 sphere = geometry.spheres[index]
                 center = wp.vec3(sphere[0], sphere[1], sphere[2])
-                outwards = wp.normalize(origin + hit.t * direction - center)
+                reached = origin + hit.t * direction
+                if wp.static(instanced):
+                    if hit.instance >= 0:
+                        moved = geometry.instances[hit.instance]
+                        reached = point_to_local(moved, origin) + hit.t * (moved.to_local * direction)
+                outwards = wp.normalize(reached - center)
                 vertex.position = center + sphere[3] * outwards
                 vertex.geometric_normal = outwards
                 if geometry.shapes[geometry.shape_of[hit.primitive]].flip == 1:
@@ -173,15 +216,26 @@ def make_vertex(triangles: bool, spheres: bool, smooth: bool, uvs: bool, tangent
                 vertex.offset = SPHERE_ERROR * (wp.dot(wp.abs(center), wp.abs(outwards)) + sphere[3])
                 if wp.static(uvs):
                     vertex.uv = sphere_uv(geometry.sphere_to_local[index] * outwards)
+                if wp.static(instanced):
+                    if hit.instance >= 0:
+                        reach = wp.abs(vertex.position) + wp.vec3(sphere[3])
+                        vertex.offset = offset_to_world(moved, vertex.offset, reach, outwards, POSITION_ERROR)
+                        vertex.position = point_to_world(moved, vertex.position)
+                        vertex.geometric_normal = normal_to_world(moved, vertex.geometric_normal)
+                        vertex.shading_normal = vertex.geometric_normal
                 if wp.static(tangents):
                     to_local = geometry.sphere_to_local[index]
                     local = to_local * outwards
                     along_u = wp.transpose(to_local) * wp.vec3(-local[1], local[0], 0.0)
+                    # From the pole (0, 0, 1) down, at half the speed of u.
+                    along_v = wp.transpose(to_local) * wp.vec3(0.0, 0.0, -1.0)
+                    along_v = wp.normalize(along_v - wp.dot(along_v, outwards) * outwards)
+                    if wp.static(instanced):
+                        if hit.instance >= 0:
+                            along_u = moved.to_world * along_u
+                            along_v = moved.to_world * along_v
                     vertex.tangent = tangent_along(vertex.shading_normal, along_u)
                     if wp.static(bumps):
-                        # From the pole (0, 0, 1) down, at half the speed of u.
-                        along_v = wp.transpose(to_local) * wp.vec3(0.0, 0.0, -1.0)
-                        along_v = wp.normalize(along_v - wp.dot(along_v, outwards) * outwards)
                         scale = wp.static(wp.pi) * sphere[3]
                         vertex.uv_jacobian = scale * in_frame(vertex, 2.0 * along_u, along_v)
         return vertex

@@ -15,7 +15,7 @@ import warp as wp
 from rich.table import Table
 
 from wavefront import queues
-from wavefront.accel.mesh_query import Hit
+from wavefront.accel.mesh_query import hit_type
 from wavefront.errors import WavefrontError
 from wavefront.film import Film
 from wavefront.integrator import Tile, Worker
@@ -23,7 +23,7 @@ from wavefront.light.sampling import LightSample
 from wavefront.light.tables import KINDS as LIGHT_KINDS
 from wavefront.queues import Paths
 from wavefront.scene import description
-from wavefront.scene.lookup import resolve_bsdf
+from wavefront.scene.lookup import indexed_shapes, resolve_bsdf
 from wavefront.stages.inspect import make_inspect_hit, make_inspect_light
 from wavefront.stages.scatter import survival_probability
 
@@ -142,12 +142,12 @@ class TraceWorker(Worker):
         self.renderer, self.vertices, self.left_out, self.end = renderer, [], [], ""
         f, scene = renderer.features, renderer.device_scene
         device = self.device
-        self.hit = wp.zeros(1, dtype=Hit, device=device)
+        self.hit = wp.zeros(1, dtype=hit_type(f.instances), device=device)
         self.light_index = wp.zeros(1, dtype=wp.int32, device=device)
         self.light_sample = wp.zeros(1, dtype=LightSample, device=device)
         tables = [scene.geometry, scene.materials, scene.textures, scene.lights]
         self.inspectors = {
-            "intersect": (make_inspect_hit(f.triangles, f.spheres), [scene.geometry, self.paths, self.hit])
+            "intersect": (make_inspect_hit(f.triangles, f.spheres, f.instances), [scene.geometry, self.paths, self.hit])
         }
         if f.light_sampling:
             arguments = [*tables, self.paths, self.surfaces, wp.uint64(renderer.seed), self.queues.counters]
@@ -156,21 +156,21 @@ class TraceWorker(Worker):
         wp.force_load(device, modules=[kernel.module for kernel, _ in self.inspectors.values()])
 
     def trace(self, x: int, y: int, sample: int) -> PathTrace:
-        """The path of one sample of a pixel."""
-        film = self.renderer.film
-        if not (0 <= x < film.width and 0 <= y < film.height):
-            raise WavefrontError(
-                f"pixel {x},{y} is not in the film; allowed: 0,0 to {film.width - 1},{film.height - 1}"
-            )
+        """The path of one sample of a pixel, which is counted in the whole film, also where a window is rendered."""
+        film, window = self.renderer.film, self.renderer.scene.film.window
+        column, row = x - window.x, y - window.y
+        if not (0 <= column < film.width and 0 <= row < film.height):
+            last = f"{window.x + film.width - 1},{window.y + film.height - 1}"
+            raise WavefrontError(f"pixel {x},{y} is not in the film; allowed: {window.x},{window.y} to {last}")
         if not 0 <= sample < 2**31 - 1:
             raise WavefrontError(f"sample {sample}; allowed: 0 to 2^31 - 2")
         self.vertices, self.left_out, self.end = [], [], ""
         self.film.arrays.L.zero_()
-        tile = Tile(x, y, 1, 1, sample, 1)
+        tile = Tile(column, row, 1, 1, sample, 1)
         self.tile.assign(np.array(dataclasses.astuple(tile), np.int32))
         self._trace(tile)
         self.check_status()
-        L = self.film.arrays.L.numpy()[x].tolist()
+        L = self.film.arrays.L.numpy()[column].tolist()
         return PathTrace((x, y), sample, self.renderer.seed, L, self.vertices, self.left_out, self.end)
 
     # --- between the stages ----------------------------------------------------------------------------------------
@@ -301,18 +301,16 @@ class TraceWorker(Worker):
 
     def _describe_primitive(self, primitive: int) -> tuple[str, str]:
         """Shape and BSDF, as in ``shapes[5] "tall box" (cube)`` and ``white (twosided, diffuse)``."""
-        scene = self.renderer.scene
-        # On the device, spheres come after the other shapes.
-        order = sorted(range(len(scene.shapes)), key=lambda i: isinstance(scene.shapes[i], description.Sphere))
-        index = order[int(self.renderer.device_scene.geometry.shape_of.numpy()[primitive])]
-        shape = scene.shapes[index]
+        scene, geometry = self.renderer.scene, self.renderer.device_scene.geometry
+        index = int(geometry.shapes.numpy()[geometry.shape_of.numpy()[primitive]]["index"])
+        path, shape = list(indexed_shapes(scene))[index]
         record, tags = resolve_bsdf(scene, shape.bsdf), []
         name = record.name
         while record is not None:
             tags.append(_tag(record))
             inner = getattr(record, "bsdf", None) or getattr(record, "front", None)
             record = resolve_bsdf(scene, inner) if inner is not None else None
-        return f"shapes[{index}] {_named(shape.name, [_tag(shape)])}", _named(name, tags)
+        return f"{path} {_named(shape.name, [_tag(shape)])}", _named(name, tags)
 
     def _describe_light(self, index: int) -> str:
         light = self.renderer.device_scene.lights.lights.numpy()[index]

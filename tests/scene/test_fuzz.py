@@ -35,6 +35,9 @@ EVERYTHING = {
         {"type": "twosided", "name": "f", "front": "a", "back": {"type": "diffuse", "reflectance": 0.3}},
         {"type": "mask", "name": "g", "bsdf": "f", "opacity": {"type": "checkerboard"}},
     ],
+    "media": [{"type": "homogeneous", "name": "tea", "sigma_a": [1, 2, 3], "scale": 0.5}],
+    "groups": [{"name": "tree", "shapes": [{"type": "sphere", "bsdf": "a"}, {"type": "cube", "exterior": "tea"}]}],
+    "instances": [{"group": "tree", "to_world": [{"scale": [1, 2, 3]}]}, {"group": "tree", "name": "second"}],
     "shapes": [
         {"type": "mesh", "file": "meshes/bowl.ply", "bsdf": "g"},
         {
@@ -47,7 +50,7 @@ EVERYTHING = {
         {"type": "rectangle", "emitter": {"type": "area", "radiance": [1, 2, 3]}, "to_world": [{"scale": 2}]},
         {"type": "cube", "to_world": [{"rotate": {"axis": [0, 1, 0], "angle": 20}}, {"translate": [0, 1, 0]}]},
         {"type": "disk", "to_world": [{"look_at": {"origin": [0, 0, 0], "target": [1, 0, 0]}}]},
-        {"type": "sphere", "center": [0, 1, 0], "radius": 0.5, "bsdf": "d", "flip_normals": True},
+        {"type": "sphere", "center": [0, 1, 0], "radius": 0.5, "bsdf": "d", "flip_normals": True, "interior": "tea"},
     ],
 }
 # Numbers that Python's json module does not write, or hypothesis does not print.

@@ -91,7 +91,8 @@ def test_text_that_is_not_json_is_refused_with_its_place(error, raw, message):
         (
             {"fiml": {}},
             "unknown key 'fiml'; did you mean 'film'? "
-            "valid keys: shapes, camera, film, integrator, textures, bsdfs, emitters, include, description",
+            "valid keys: shapes, camera, film, integrator, textures, bsdfs, media, groups, instances, emitters, "
+            "include, description",
         ),
         (
             {"film": {"a\nb": 1}},
@@ -291,7 +292,7 @@ def test_errors_name_the_included_file_and_the_place_in_it(write, error, tmp_pat
     write({"film": {}}, "a.json")
     assert error(main) == (
         "a.json: key 'film' cannot be included; an included file has only: "
-        "textures, bsdfs, emitters, shapes, description, include"
+        "textures, bsdfs, media, emitters, groups, shapes, instances, description, include"
     )
     write({"shapes": [{"type": "sphere", "radius": 0}]}, "a.json")
     assert error(main) == "a.json: shapes[0].radius: expected a number > 0; found 0"

@@ -57,7 +57,19 @@ class _Writer:
         for i, emitter in enumerate(self.scene.emitters):
             result[f"emitter_{i}"] = self._emitter(emitter, f"emitters[{i}]")
         for i, shape in enumerate(self.scene.shapes):
-            result[f"shape_{i}"] = self._shape(i, shape)
+            result[f"shape_{i}"] = self._shape(f"shape_{i}", shape, f"shapes[{i}]")
+        names = {group.name: f"group_{i}" for i, group in enumerate(self.scene.groups)}
+        for i, group in enumerate(self.scene.groups):
+            result[f"group_{i}"] = {"type": "shapegroup"} | {
+                f"shape_{j}": self._shape(f"group_{i}_shape_{j}", shape, f"groups[{i}].shapes[{j}]")
+                for j, shape in enumerate(group.shapes)
+            }
+        for i, instance in enumerate(self.scene.instances):
+            result[f"instance_{i}"] = {
+                "type": "instance",
+                "group": {"type": "ref", "id": names[instance.group]},
+                "to_world": self._transform(to_matrix(instance.to_world, f"instances[{i}].to_world")),
+            }
         return result
 
     def _camera(self):
@@ -142,8 +154,7 @@ class _Writer:
 
     # --- shapes --------------------------------------------------------------------------------------------------
 
-    def _shape(self, index, shape):
-        where = f"shapes[{index}]"
+    def _shape(self, key, shape, where):
         result = {"bsdf": self._bsdf(shape.bsdf)} | self._media(interior=shape.interior, exterior=shape.exterior)
         if shape.emitter is not None:
             if shape.emitter.two_sided:
@@ -152,7 +163,7 @@ class _Writer:
         if isinstance(shape, description.Mesh):
             # The triangles that we read ourselves: reading files is compared through Mitsuba's XML.
             mesh = tessellate(shape, where)
-            file = self.folder / f"shape_{index}.ply"
+            file = self.folder / f"{key}.ply"
             write_ply(file, mesh)
             return result | {"type": "ply", "filename": str(file), "face_normals": mesh.normals is None}
         matrix = to_matrix(shape.to_world, f"{where}.to_world")

@@ -549,6 +549,22 @@ class Sphere(Shape, tag_field="type", tag="sphere"):
 
 AnyShape = Mesh | Rectangle | Cube | Disk | Sphere
 
+
+class Group(Record):
+    """Shapes that are there where instances put them, any number of times, and are stored once. None of them emits."""
+
+    name: Annotated[str, Meta(min_length=1)]
+    shapes: Annotated[list[AnyShape], Meta(description="In the group's own space.")]
+
+
+class Instance(Record):
+    """A group, put into the scene."""
+
+    group: Annotated[str, Meta(description="Name of a group.")]
+    name: str = ""
+    to_world: Annotated[Transform, Meta(description="From the group's space; any scale, shear or mirror.")] = []
+
+
 # --- camera, film, integrator ------------------------------------------------------------------------------------
 
 
@@ -687,9 +703,14 @@ class Scene(Record):
     textures: Annotated[list[Texture], Meta(description="Named textures.")] = []
     bsdfs: Annotated[list[Bsdf], Meta(description="Named BSDFs.")] = []
     media: Annotated[list[Medium], Meta(description="Named media.")] = []
+    groups: Annotated[list[Group], Meta(description="Shapes for instances; not seen otherwise.")] = []
+    instances: Annotated[list[Instance], Meta(description="Groups, put into the scene.")] = []
     emitters: Annotated[list[Emitter], Meta(description="Emitters that are not shapes; at most one environment.")] = []
     include: Annotated[
         list[str],
-        Meta(description="Scene files whose textures, bsdfs, media, emitters and shapes are added to this one."),
+        Meta(
+            description="Scene files whose textures, bsdfs, media, emitters, groups, shapes and instances are added to "
+            "this one."
+        ),
     ] = []
     description: Annotated[str, Meta(description="What the scene is for.")] = ""

@@ -13,6 +13,7 @@ from wavefront.errors import SceneError
 from wavefront.film import LUMINANCE
 from wavefront.light.tables import EmitterRecord, LightTables
 from wavefront.scene import description
+from wavefront.scene.instance_upload import InstanceUpload, Part
 from wavefront.scene.light_upload import LightUpload
 from wavefront.scene.lookup import shown
 from wavefront.scene.material_upload import MaterialUpload
@@ -31,8 +32,10 @@ class DeviceScene:
     materials: bsdf_tables.MaterialTables
     textures: TextureTables
     lights: LightTables
-    triangle_count: int
+    triangle_count: int  # in memory, those of groups once
     sphere_count: int
+    instanced_triangle_count: int  # as many as there would be without groups
+    instance_count: int
     light_count: int
     # What the kernels must know
     smooth: bool
@@ -41,6 +44,7 @@ class DeviceScene:
     tangents: bool
     media: bool
     maps: tuple[str, ...]
+    instances: tuple[str, ...]
     texture_kinds: tuple[str, ...]
     light_kinds: tuple[str, ...]
     light_texture_kinds: tuple[str, ...]
@@ -63,14 +67,21 @@ class _Upload:
         self.atlas = TextureAtlas()
         self.materials = MaterialUpload(scene, self.atlas)
         self.media = MediumUpload(scene)
+        self.instances = InstanceUpload(scene, device)
         self.emitters: list[dict] = []
         self.light_texture_kinds: set[str] = set()
+        self.shape_count = 0
         self.keep_alive: list = []
         self.notes: list[str] = []
 
     def run(self) -> DeviceScene:
-        meshes, spheres = self._collect_shapes()
-        geometry, bounds = self._upload_geometry(meshes, spheres)
+        meshes, spheres = self._collect_shapes(self.scene.shapes, "shapes")
+        collected = [(meshes, spheres)]
+        for i, group in enumerate(self.scene.groups):
+            if group.name in self.instances.names:
+                collected.append(self._collect_shapes(group.shapes, f"groups[{i}].shapes"))
+        clear_cache()
+        geometry, bounds, parts = self._upload_geometry(collected)
         luminances = [self._mean_luminance(emitter) for emitter in range(len(self.emitters))]
         upload = LightUpload(self.scene, self.emitters, luminances, self.device, self.notes)
         lights, light_kinds = upload.run(meshes, spheres, bounds)
@@ -83,14 +94,22 @@ class _Upload:
             textures=self.atlas.upload(self.device),
             lights=lights,
             triangle_count=geometry.triangle_count,
-            sphere_count=len(spheres),
+            sphere_count=geometry.spheres.shape[0] if geometry.spheres else 0,
+            instanced_triangle_count=parts[0].triangle_count
+            + sum(parts[1 + i].triangle_count for i in self.instances.group_of),
+            instance_count=len(self.instances.group_of),
             light_count=lights.lights.shape[0],
-            smooth=any(mesh.normals is not None for _, mesh, _ in meshes),
+            smooth=any(mesh.normals is not None for meshes, _ in collected for _, mesh, _ in meshes),
             bsdfs=tuple(sorted(self.materials.kinds)),
             mask=self.materials.mask,
             tangents=self.materials.tangents,
             media=self.media.absorbing,
             maps=tuple(sorted(self.materials.map_kinds)),
+            instances=tuple(
+                kind
+                for kind, field in (("spheres", "sphere_bvh"), ("triangles", "mesh"))
+                if any(getattr(part, field) for part in parts[1:])
+            ),
             texture_kinds=tuple(sorted(set(self.atlas.kinds))),
             light_kinds=light_kinds,
             light_texture_kinds=tuple(sorted(self.light_texture_kinds)),
@@ -100,15 +119,16 @@ class _Upload:
 
     # --- geometry --------------------------------------------------------------------------------------------------
 
-    def _collect_shapes(self):
+    def _collect_shapes(self, shapes, path):
         """Meshes as (shape record, triangles, emitter index) and spheres as (shape record, centre, radius, emitter)."""
         meshes, spheres = [], []
-        for i, shape in enumerate(self.scene.shapes):
-            where = f"shapes[{i}]"
+        for i, shape in enumerate(shapes):
+            where = f"{path}[{i}]"
             named = where + (f" ({shown(shape.name)})" if shape.name else "")
             emitter = self._emitter(shape.emitter, where) if shape.emitter is not None else -1
             record = {"material": self.materials.add(shape.bsdf, f"{where}.bsdf"), "first_light": -1}
-            record["index"] = i
+            record["index"] = self.shape_count
+            self.shape_count += 1
             record["two_sided"] = int(shape.emitter is not None and shape.emitter.two_sided)
             record |= self.media.sides(shape)
             if isinstance(shape, description.Sphere):
@@ -132,11 +152,20 @@ class _Upload:
                 record["smooth"] = int(mesh.normals is not None)
                 record["polar"] = int(isinstance(shape, description.Disk))
                 meshes.append((record, mesh, emitter))
-        clear_cache()
         return meshes, spheres
 
-    def _upload_geometry(self, meshes, spheres) -> tuple[Geometry, np.ndarray]:
+    def _upload_geometry(self, collected) -> tuple[Geometry, np.ndarray, list[Part]]:
+        """From (meshes, spheres) of the scene itself, then of each group; triangles and spheres are in that order."""
         device = self.device
+        meshes, spheres = ([item for pair in collected for item in pair[kind]] for kind in (0, 1))
+        parts = [Part(0, 0, 0, 0)]
+        for part_meshes, part_spheres in collected:
+            last = parts[-1]
+            count = sum(len(mesh.faces) for _, mesh, _ in part_meshes)
+            first, first_sphere = last.first_triangle + last.triangle_count, last.first_sphere + last.sphere_count
+            parts.append(Part(first, count, first_sphere, len(part_spheres)))
+            parts[-1].enclose(mesh.vertices for _, mesh, _ in part_meshes)
+        del parts[0]
         geometry = Geometry()
         points = np.concatenate([mesh.vertices for _, mesh, _ in meshes] or [np.zeros((0, 3), np.float32)])
         starts = np.cumsum([0] + [len(mesh.vertices) for _, mesh, _ in meshes])
@@ -160,25 +189,34 @@ class _Upload:
             if spheres:
                 rotations = np.stack([rotation.T for *_, rotation in spheres])
                 geometry.sphere_to_local = wp.array(rotations, dtype=wp.mat33, device=device)
-        lower, upper = np.full(3, np.inf), np.full(3, -np.inf)
-        if len(faces):
-            # Leaves of 2 triangles traced fastest of 1, 2, 4 and 8 on the CPU device.
-            mesh = wp.Mesh(geometry.points, geometry.indices, bvh_constructor="sah", bvh_leaf_size=2)
-            self.keep_alive.append(mesh)
-            geometry.mesh = mesh.id
-            lower, upper = points.min(axis=0), points.max(axis=0)
         if spheres:
             table = np.array([[*center, radius] for _, center, radius, *_ in spheres], np.float32)
             geometry.spheres = wp.array(table, dtype=wp.vec4, device=device)
             # The box is grown by some roundings, so that its sides never cut the sphere.
             grown = table[:, 3:] + 1e-6 * (np.abs(table[:, :3]).max(axis=1, keepdims=True) + table[:, 3:])
             lowers, uppers = table[:, :3] - grown, table[:, :3] + grown
-            bvh = wp.Bvh(wp.array(lowers, dtype=wp.vec3, device=device), wp.array(uppers, dtype=wp.vec3, device=device))
-            self.keep_alive.append(bvh)
-            geometry.sphere_bvh = bvh.id
-            lower, upper = np.minimum(lower, lowers.min(axis=0)), np.maximum(upper, uppers.max(axis=0))
-        bounds = np.array([lower, upper]) if len(counts) else np.zeros((2, 3))
-        return geometry, bounds
+        for part in parts:
+            triangles = slice(part.first_triangle, part.first_triangle + part.triangle_count)
+            balls = slice(part.first_sphere, part.first_sphere + part.sphere_count)
+            if part.triangle_count:
+                # Vertices are those of all; leaves of 2 triangles traced fastest of 1, 2, 4 and 8 on the CPU device.
+                indices = geometry.indices[3 * triangles.start : 3 * triangles.stop]
+                mesh = wp.Mesh(geometry.points, indices, bvh_constructor="sah", bvh_leaf_size=2)
+                self.keep_alive.append(mesh)
+                part.mesh = mesh.id
+            if part.sphere_count:
+                boxes = (wp.array(corner[balls], dtype=wp.vec3, device=device) for corner in (lowers, uppers))
+                bvh = wp.Bvh(*boxes)
+                self.keep_alive.append(bvh)
+                part.sphere_bvh = bvh.id
+                part.enclose([lowers[balls], uppers[balls]])
+        geometry.mesh, geometry.sphere_bvh = parts[0].mesh, parts[0].sphere_bvh
+        bounds = parts[0].bounds
+        if len(parts) > 1:
+            instances = self.instances.upload(geometry, parts[1:])
+            self.keep_alive.append(self.instances.bvh)
+            bounds = np.array([np.minimum(bounds[0], instances[0]), np.maximum(bounds[1], instances[1])])
+        return geometry, bounds if len(counts) else np.zeros((2, 3)), parts
 
     # --- lights ----------------------------------------------------------------------------------------------------
 

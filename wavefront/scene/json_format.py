@@ -19,7 +19,7 @@ from wavefront.scene.explain import explain, format_path, found
 from wavefront.scene.lookup import NUMBER_FIELDS, shown, walk
 from wavefront.scene.validate import validate
 
-INCLUDABLE = ("textures", "bsdfs", "media", "emitters", "shapes")
+INCLUDABLE = ("textures", "bsdfs", "media", "emitters", "groups", "shapes", "instances")
 _INCLUDE_KEYS = (*INCLUDABLE, "description", "include")
 _OVERRIDE_STEP = re.compile(r"([A-Za-z_]\w*)((?:\[\d{1,9}\])*)")
 _LINE_LENGTH = 120

@@ -70,6 +70,15 @@ def resolve_bsdf(scene: description.Scene, ref: str | description.Bsdf | None) -
     return _resolve("bsdf", scene.bsdfs, ref)
 
 
+def indexed_shapes(scene: description.Scene) -> Iterator[tuple[str, description.AnyShape]]:
+    """All shapes with their paths, those of groups after the others: their order is the index of a shape."""
+    for i, shape in enumerate(scene.shapes):
+        yield f"shapes[{i}]", shape
+    for g, group in enumerate(scene.groups):
+        for i, shape in enumerate(group.shapes):
+            yield f"groups[{g}].shapes[{i}]", shape
+
+
 def bsdf_of_shape(scene: description.Scene) -> list[int]:
     """Index of the BSDF of each shape: its place in `bsdfs`; those that stand in shapes are counted on from there."""
     places = {bsdf.name: i for i, bsdf in enumerate(scene.bsdfs)}

@@ -5,6 +5,7 @@ or is left out. Where the dialects differ in meaning, Mitsuba 3.9 decides: it is
 
 Choices: unlimited `max_depth` (-1) becomes 1000. Integrators that compute the same image another way (bdpt, sppm, ...)
 become `path` with a warning, and `direct` becomes `path` of depth 2. Filters that the records lack become a Gaussian.
+Media absorb whatever the integrator.
 """
 
 from __future__ import annotations
@@ -71,6 +72,7 @@ class _Importer:
         self.materials = Materials(document, warn)
         self.media = Media(document, warn)
         self.emitters = Emitters(document, warn, self.materials)
+        self.groups: dict[int, description.Group] = {}  # by the id() of their plugin, in the order of their first use
 
     def scene(self):
         root = self.document.scene
@@ -88,7 +90,12 @@ class _Importer:
             raise groups["integrator"][1].error("a scene has one integrator")
         camera, film, spp = self._sensor(groups.get("sensor", []))
         integrator = self._integrator(groups.get("integrator", [None])[0], spp)
-        shapes = [self._shape(plugin) for plugin in groups.get("shape", [])]
+        shapes, instances = [], []
+        for plugin in groups.get("shape", []):
+            if plugin.type == "instance":
+                instances.append(self._instance(plugin))
+            elif plugin.type != "shapegroup":
+                shapes.append(self._shape(plugin))
         emitters = [self.emitters.emitter(plugin) for plugin in groups.get("emitter", [])]
         self.materials.unused()
         media = self.media.records()
@@ -97,6 +104,8 @@ class _Importer:
             self.warn(f"{plugin.where()}: {plugin.label()} of Mitsuba leaves media out; here they absorb")
         return description.Scene(
             shapes=shapes,
+            groups=list(self.groups.values()),
+            instances=instances,
             camera=camera,
             film=film,
             integrator=integrator,
@@ -277,7 +286,8 @@ class _Importer:
             "sphere": self._sphere,
         }
         if plugin.type not in kinds:
-            raise plugin.error(f"{plugin.label()} is not supported; supported: {', '.join(kinds)}")
+            supported = ", ".join([*kinds, "shapegroup", "instance"])
+            raise plugin.error(f"{plugin.label()} is not supported; supported: {supported}")
         common = {"name": plugin.id, "flip_normals": plugin.boolean("flip_normals")}
         matrix = world_matrix(plugin)
         if not np.array_equal(matrix, np.eye(4)):
@@ -296,6 +306,37 @@ class _Importer:
         record = kinds[plugin.type](plugin, common, transforms.is_mirror(matrix))
         plugin.finish(*_NESTED)
         return record
+
+    def _instance(self, plugin):
+        groups = plugin.objects("shape")
+        if len(groups) != 1 or groups[0].type != "shapegroup":
+            found = ", ".join(group.label() for group in groups) or "none"
+            raise plugin.error(f"an instance needs one shapegroup; found {found}")
+        matrix = world_matrix(plugin)
+        plugin.finish("shape")
+        to_world = [] if np.array_equal(matrix, np.eye(4)) else rows(matrix)
+        return description.Instance(group=self._group(groups[0]).name, name=plugin.id, to_world=to_world)
+
+    def _group(self, plugin):
+        if id(plugin) not in self.groups:
+            if plugin.get("to_world") is not None:
+                raise plugin.get("to_world").error("a shapegroup has no to_world; its instances have")
+            children = plugin.objects("shape")
+            if not children:
+                raise plugin.error("the shapegroup is empty")
+            for child in children:
+                if child.type in ("shapegroup", "instance"):
+                    raise child.error("a shapegroup cannot hold instances or other groups")
+            shapes = [self._shape(child) for child in children]
+            for child, shape in zip(children, shapes, strict=True):
+                if shape.emitter is not None:
+                    raise child.error("a shape of a shapegroup cannot emit: lights are not instanced")
+            plugin.finish("shape")
+            name = plugin.id or f"group {len(self.groups) + 1}"
+            while any(group.name == name for group in self.groups.values()):
+                name += "'"
+            self.groups[id(plugin)] = description.Group(name=name, shapes=shapes)
+        return self.groups[id(plugin)]
 
     def _primitive(self, record):
         def convert(plugin, common, mirrored):

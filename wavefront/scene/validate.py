@@ -66,11 +66,8 @@ def validate(
             elif isinstance(record, description.Homogeneous):
                 _check_value([record.scale * value for value in np.ravel(record.sigma_a).tolist()], f"{path}.sigma_a")
         for i, shape in enumerate(scene.shapes):
-            matrix = _check_transform(shape.to_world, f"shapes[{i}].to_world")
-            if isinstance(shape, description.Sphere) and matrix is not None and not _is_similarity(matrix):
-                _fail(
-                    f"shapes[{i}].to_world", "a sphere can be scaled uniformly only; found different scales or a shear"
-                )
+            _check_shape(shape, f"shapes[{i}]")
+        _check_groups(scene)
         _check_camera(scene.camera)
         _check_crop(scene.film)
         _check_emitters(scene)
@@ -91,7 +88,7 @@ def _fail(path, message):
 
 def _find_warnings(scene):
     warnings = []
-    if not scene.shapes:
+    if not scene.shapes and not scene.instances:
         warnings.append("the scene has no shapes")
     if not scene.emitters and all(shape.emitter is None for shape in scene.shapes):
         warnings.append("the scene has no emitter: the image will be black")
@@ -105,6 +102,10 @@ def _find_warnings(scene):
         for i, record in enumerate(getattr(scene, kind)):
             if not record.name:
                 warnings.append(f"{kind}[{i}] has no name, so nothing can refer to it")
+    used = {instance.group for instance in scene.instances}
+    for i, group in enumerate(scene.groups):
+        if group.name not in used:
+            warnings.append(f"groups[{i}]: no instance puts {shown(group.name)} into the scene")
     return warnings
 
 
@@ -112,7 +113,7 @@ def _find_warnings(scene):
 
 
 def _check_names(scene):
-    for kind in ("textures", "bsdfs", "media", "emitters", "shapes"):
+    for kind in ("textures", "bsdfs", "media", "emitters", "groups", "shapes", "instances"):
         seen = set()
         for i, record in enumerate(getattr(scene, kind)):
             if record.name and record.name in seen:
@@ -320,6 +321,31 @@ def _check_crop(film):
 
 
 # --- shapes ----------------------------------------------------------------------------------------------------
+
+
+def _check_shape(shape, path):
+    matrix = _check_transform(shape.to_world, f"{path}.to_world")
+    if isinstance(shape, description.Sphere) and matrix is not None and not _is_similarity(matrix):
+        _fail(f"{path}.to_world", "a sphere can be scaled uniformly only; found different scales or a shear")
+
+
+def _check_groups(scene):
+    for i, group in enumerate(scene.groups):
+        if not group.shapes:
+            _fail(f"groups[{i}].shapes", "the group is empty")
+        for j, shape in enumerate(group.shapes):
+            path = f"groups[{i}].shapes[{j}]"
+            _check_shape(shape, path)
+            if shape.emitter is not None:
+                _fail(f"{path}.emitter", "a shape of a group cannot emit: lights are not instanced")
+    names = {group.name for group in scene.groups}
+    for i, instance in enumerate(scene.instances):
+        if instance.group not in names:
+            _fail(f"instances[{i}].group", unknown_name("group", instance.group, names))
+        path = f"instances[{i}].to_world"
+        matrix = _check_transform(instance.to_world, path)
+        if matrix is not None and not np.all(np.abs(np.linalg.inv(matrix[:3, :3])) <= _LARGEST):
+            _fail(path, f"the transform's inverse has a number above {_LARGEST:.4g}, too large for 32-bit floats")
 
 
 def _check_file(file, suffixes, kind, path):

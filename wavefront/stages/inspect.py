@@ -6,7 +6,7 @@ import functools
 
 import warp as wp
 
-from wavefront.accel.mesh_query import Geometry, Hit, make_intersector
+from wavefront.accel.mesh_query import Geometry, hit_type, make_intersector
 from wavefront.bsdf.dispatch import is_smooth
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.light.sampling import LightSample, make_light_sampler, select_light
@@ -17,16 +17,17 @@ from wavefront.texture import TextureTables
 
 
 @functools.cache
-def make_inspect_hit(triangles: bool, spheres: bool):
+def make_inspect_hit(triangles: bool, spheres: bool, instances: tuple[str, ...]):
     """Kernel that finds the primitive which the ray in slot 0 meets; the arguments are fields of `Features`."""
-    closest_hit, _ = make_intersector(triangles, spheres)
+    closest_hit, _ = make_intersector(triangles, spheres, instances)
+    AnyHit = hit_type(instances)
 
     @wp.kernel(enable_backward=False, module="unique")
     def inspect_hit(
         geometry: Geometry,
         paths: Paths,
         # out
-        hit: wp.array[Hit],
+        hit: wp.array[AnyHit],
     ):
         hit[0] = closest_hit(geometry, paths.origin[0], paths.direction[0])
 

@@ -24,13 +24,14 @@ def make_intersect(
     escape_lights: bool,
     shape_index: bool = False,
     media: bool = False,
+    instances: tuple[str, ...] = (),
 ):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name (or whether there are any).
 
     `shape_index`: whether the index of the shape is an AOV.
     """
-    closest_hit, _ = make_intersector(triangles, spheres)
-    vertex_of = make_vertex(triangles, spheres, smooth, uvs, tangents, bumps)
+    closest_hit, _ = make_intersector(triangles, spheres, instances)
+    vertex_of = make_vertex(triangles, spheres, smooth, uvs, tangents, bumps, instances)
 
     @wp.kernel(enable_backward=False, module="unique")
     def closest_hits(

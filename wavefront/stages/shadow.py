@@ -11,9 +11,9 @@ from wavefront.queues import Paths, Queue, ShadowRays, queue_size
 
 
 @functools.cache
-def make_shadow(triangles: bool, spheres: bool):
+def make_shadow(triangles: bool, spheres: bool, instances: tuple[str, ...] = ()):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
-    _, occluded = make_intersector(triangles, spheres)
+    _, occluded = make_intersector(triangles, spheres, instances)
 
     @wp.kernel(enable_backward=False, module="unique")
     def trace_shadow_rays(

@@ -1,0 +1,85 @@
+"""From groups and instances to the device: one acceleration structure a group, and a hierarchy of instances above."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+
+import numpy as np
+import warp as wp
+
+from wavefront.accel.instance import Group, Instance
+from wavefront.accel.mesh_query import Geometry
+from wavefront.scene import description
+from wavefront.scene.texture_upload import struct_array
+from wavefront.scene.transforms import to_matrix
+from wavefront.surface import POSITION_ERROR
+
+
+@dataclasses.dataclass
+class Part:
+    """Consecutive triangles and spheres that are traced together: those of the scene itself, or of a group."""
+
+    first_triangle: int
+    triangle_count: int
+    first_sphere: int
+    sphere_count: int
+    mesh: int = 0  # handle of the acceleration structure; 0: no triangles
+    sphere_bvh: int = 0
+    bounds: np.ndarray = dataclasses.field(default_factory=lambda: np.array([np.full(3, np.inf), np.full(3, -np.inf)]))
+
+    def enclose(self, points: Iterable[np.ndarray]) -> None:
+        """Grows the bounds to include points, arrays of [N, 3]."""
+        for array in points:
+            self.bounds[0] = np.minimum(self.bounds[0], array.min(axis=0))
+            self.bounds[1] = np.maximum(self.bounds[1], array.max(axis=0))
+
+
+class InstanceUpload:
+    """Puts groups into the scene.
+
+    Args:
+        scene: Valid records.
+        device: Where to.
+    """
+
+    def __init__(self, scene: description.Scene, device: str):
+        self.device = device
+        used = {instance.group for instance in scene.instances}
+        self.names = [group.name for group in scene.groups if group.name in used]  # the others are not uploaded
+        index = {name: i for i, name in enumerate(self.names)}
+        self.group_of = np.array([index[instance.group] for instance in scene.instances], np.int32)
+        matrices = [to_matrix(item.to_world, f"instances[{i}].to_world") for i, item in enumerate(scene.instances)]
+        self.matrices = np.array(matrices).reshape(-1, 4, 4)
+        self.bvh: wp.Bvh | None = None
+
+    def upload(self, geometry: Geometry, parts: list[Part]) -> np.ndarray:
+        """Fills in the instances of `geometry` and returns their bounds, lower and upper corner.
+
+        Args:
+            geometry: Changed.
+            parts: Of each group.
+        """
+        host = np.zeros(len(self.matrices), Instance.numpy_dtype())
+        # The inverse is that of the rounded matrix.
+        host["to_world"], host["translation"] = self.matrices[:, :3, :3], self.matrices[:, :3, 3]
+        host["to_local"] = np.linalg.inv(host["to_world"].astype(np.float64))
+        host["group"] = self.group_of
+        geometry.instances = wp.array(host, dtype=Instance, device=self.device)
+        names = ("mesh", "sphere_bvh", "first_triangle", "first_sphere")
+        records = [{name: getattr(part, name) for name in names} for part in parts]
+        geometry.groups = struct_array(Group, records, self.device)
+
+        bounds = np.array([part.bounds for part in parts])[self.group_of]
+        linear, translation = np.abs(self.matrices[:, :3, :3]), self.matrices[:, :3, 3]
+        center = np.einsum("nij,nj->ni", self.matrices[:, :3, :3], bounds.mean(axis=1)) + translation
+        half = np.einsum("nij,nj->ni", linear, 0.5 * (bounds[:, 1] - bounds[:, 0]))
+        # Grown by the roundings of a ray on its way to local space, so that no side cuts off what is inside.
+        half += float(POSITION_ERROR) * (
+            np.einsum("nij,nj->ni", linear, np.abs(bounds).max(axis=1)) + np.abs(translation)
+        )
+        lower, upper = ((center + sign * half).astype(np.float32) for sign in (-1.0, 1.0))
+        boxes = (wp.array(corner, dtype=wp.vec3, device=self.device) for corner in (lower, upper))
+        self.bvh = wp.Bvh(*boxes)
+        geometry.instance_bvh = self.bvh.id
+        return np.array([lower.min(axis=0), upper.max(axis=0)])
