@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import itertools
 from collections.abc import Iterable, Iterator
 
 from wavefront.bsdf.tables import PRINCIPLED_FRACTIONS
@@ -82,8 +83,8 @@ def indexed_shapes(scene: description.Scene) -> Iterator[tuple[str, description.
 def bsdf_of_shape(scene: description.Scene) -> list[int]:
     """Index of the BSDF of each shape: its place in `bsdfs`; those that stand in shapes are counted on from there."""
     places = {bsdf.name: i for i, bsdf in enumerate(scene.bsdfs)}
-    own = iter(range(len(scene.bsdfs), len(scene.bsdfs) + len(scene.shapes)))
-    return [places[shape.bsdf] if isinstance(shape.bsdf, str) else next(own) for shape in scene.shapes]
+    own = itertools.count(len(scene.bsdfs))
+    return [places[shape.bsdf] if isinstance(shape.bsdf, str) else next(own) for _, shape in indexed_shapes(scene)]
 
 
 def resolve_texture(scene: description.Scene, ref: object) -> object:
