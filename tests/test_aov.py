@@ -158,7 +158,7 @@ def test_row_blocks_cover_an_image_once(width, height):
     blocks = list(row_blocks(width, height))
     assert blocks[0][0] == 0 and blocks[-1][1] == height
     assert all(before[1] == after[0] for before, after in itertools.pairwise(blocks))
-    assert max(last - first for first, last in blocks) * width <= 1 << 18
+    assert max(last - first for first, last in blocks) * width <= 1 << 17
 
 
 @pytest.mark.parametrize("aovs", [(), ("variance",), ("sample_count",), ("shape_index", "bsdf_index"), tuple(ALL)])

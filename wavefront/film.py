@@ -23,7 +23,7 @@ CHANNELS = {
     "variance": "Y",
 }
 INTEGERS = ("shape_index.I", "bsdf_index.I", "sample_count.I")  # channels that 16-bit floats would round
-BLOCK_PIXELS = 1 << 18  # of a film that is turned into an image block by block
+BLOCK_PIXELS = 1 << 17  # of a film that is turned into an image block by block
 
 
 @wp.struct

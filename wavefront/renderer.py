@@ -91,9 +91,13 @@ def resident_bytes() -> int:
 
 
 def output_bytes(aovs: tuple[str, ...]) -> int:
-    """Memory that writing a film takes, at most: a block of rows in float64, as channels and interleaved; libraries."""
+    """Memory that writing a film takes, at most.
+
+    Two blocks of rows, the next being made while the last is held: means in float64, then channels and the same
+    interleaved in float32; the copies of the last one that the library makes; and what it takes by itself.
+    """
     channels = 3 + sum(len(CHANNELS[aov]) for aov in aovs)
-    return BLOCK_PIXELS * (24 + 3 * 4 * channels) + OUTPUT_LIBRARIES
+    return BLOCK_PIXELS * 2 * (24 + 3 * 4 * channels) + OUTPUT_LIBRARIES
 
 
 class Renderer:
