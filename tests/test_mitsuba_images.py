@@ -169,7 +169,7 @@ def test_records_of_a_file(folder, name):
 
 
 # Of these Mitsuba has no counterpart, or (`test_mitsuba_media`, `test_mitsuba_instances`) not with the same settings.
-OURS_ALONE = ("light-sun", "material-oren-nayar", "coloured-glass", "instances")
+OURS_ALONE = ("light-sun", "light-sunsky", "material-oren-nayar", "coloured-glass", "instances")
 # Caustics and indirect light alone: 0.1 % would take hours.
 NOISY = ("door-ajar", "glass-caustic", "glossy-plates")
 

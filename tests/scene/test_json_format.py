@@ -142,7 +142,7 @@ def test_text_that_is_not_json_is_refused_with_its_place(error, raw, message):
         ),
         (
             {"camera": {"type": "orthographic", "fov": 3}},
-            "camera: unknown key 'fov'; valid keys: type, width, to_world",
+            "camera: unknown key 'fov'; valid keys: type, width, to_world, medium",
         ),
         ({"film": {"crop": {"width": 3}}}, "film.crop: missing key 'height'"),
         (

@@ -303,8 +303,9 @@ def _check_sun(emitter, path):
 
 def _check_camera(camera):
     matrix = _check_transform(camera.to_world, "camera.to_world")
-    if matrix is not None and np.abs(matrix[:3, 3]).max() > LARGEST_COORDINATE:
-        _fail("camera.to_world", f"the camera is beyond {LARGEST_COORDINATE:g} m, where 32-bit rays hit nothing")
+    farthest = 10.0 * LARGEST_COORDINATE  # with room to see all of what may be there
+    if matrix is not None and np.abs(matrix[:3, 3]).max() > farthest:
+        _fail("camera.to_world", f"the camera is beyond {farthest:g} m, where 32-bit rays hit nothing")
     scale = 1.0 if matrix is None else np.abs(matrix[:3, :3]).max()
     for name in ("aperture_radius", "width"):
         if getattr(camera, name, 0.0) * scale > _LARGEST:

@@ -1,7 +1,5 @@
 """What the other stages decide and do not keep, told again for one path: its hit, and the light that it sampled."""
 
-from __future__ import annotations
-
 import functools
 
 import warp as wp
