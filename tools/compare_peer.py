@@ -6,7 +6,9 @@ tile and channel tests that pass at 95 % (95 % are expected of equal images), th
 their number, and the ratio of the image means with its 95 % interval. A scene is the *same* if no tile differs at a
 false alarm rate of 1e-4 and the interval meets 1 +- 0.005; it is *noisy* if the interval is wider than 0.02.
 Next-event estimation, no Russian roulette, box filter. Media are compared with Mitsuba's `volpath`; its `path` ignores
-them. Pictures: ours, Mitsuba's, and where tiles differ (red: ours is brighter, blue: darker; white: 4 standard errors).
+them. A `sunsky`, of which each renderer has a model of its own, is baked by Mitsuba, so that the transport is compared
+(`tools.bake`); ours is shown beside it. Pictures: ours, Mitsuba's, and where tiles differ (red: ours is brighter, blue:
+darker; full colour: 4 standard errors).
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ import dataclasses
 import json
 import os
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,19 +28,24 @@ from PIL import Image
 from rich.console import Console
 from rich.table import Table
 
+from tools.bake import bake_sunsky, baked_xml, replace_records
 from tools.bench_common import machine
 from tools.image_test import FALSE_ALARM_RATE, RATIO_TOLERANCE, Comparison, Estimate, tile_means
 from tools.peers import mitsuba as peer
 from tools.peers.images import like_the_peer, our_batches, rounding_of, their_batches
+from tools.peers.mitsuba_records import integrator_of
 from wavefront.errors import WavefrontError
 from wavefront.output import tone_map
-from wavefront.scene import load_scene
+from wavefront.renderer import Renderer
+from wavefront.scene import description, load_scene
 from wavefront.scene.images import replacing
 
 TILE_ROWS = 9
 BATCHES = 48  # of each renderer, about; their spread tells the noise
 LEAST_BATCHES = 16
 NOISY = 0.02  # width of an interval that says nothing
+OWN_SKY_SAMPLES = 64
+SHEET_WIDTH = 1280  # pixels
 
 
 @dataclasses.dataclass
@@ -49,6 +57,7 @@ class Row:
         note: What is compared, where it is not simply the file.
         comparison: Ours over Mitsuba's.
         images: Mean radiance of ours and of Mitsuba's, [height, width, 3] each.
+        own_sky: The same with our own model of the sky, where the light was baked.
         samples: Per pixel, of ours and of Mitsuba's.
         seconds: Wall time of ours and of Mitsuba's.
     """
@@ -57,6 +66,7 @@ class Row:
     note: str
     comparison: Comparison
     images: tuple[np.ndarray, np.ndarray]
+    own_sky: np.ndarray | None
     samples: tuple[int, int]
     seconds: tuple[float, float]
 
@@ -137,13 +147,27 @@ def batch_samples(make, seconds: float) -> int:
 def compare_scene(path: Path, arguments: argparse.Namespace, progress) -> Row:
     """Draws batches of both renderers in turn until the ratio of the means is known well enough."""
     name = path.resolve().parent.name
-    scene = load_scene(path)
+    scene = load_scene(path, warn=lambda message: progress(f"{name}: {message}"))
     columns = max(1, round(TILE_ROWS * scene.film.width / scene.film.height))
     tiles, side = (TILE_ROWS, columns), max(1, arguments.width // columns)
     width, height = columns * side, TILE_ROWS * side
     depth = min(scene.integrator.max_depth, arguments.max_depth)
     like_the_peer(scene, width, height, depth)
-    theirs, note, integrator = peer.load_xml(path, width, height), "", "path"
+    integrator, notes, xml, own_sky = integrator_of(scene), [], path, None
+    if integrator != "path":
+        notes.append(integrator)
+    with tempfile.TemporaryDirectory(prefix="wavefront-peer-") as folder:
+        if any(isinstance(emitter, description.SunSky) for emitter in scene.emitters):
+            notes.append("sky baked by Mitsuba")
+            own_sky = Renderer(scene, threads=arguments.threads).render(spp=OWN_SKY_SAMPLES)
+            baked = bake_sunsky(path, folder)
+            scene, xml = replace_records(scene, baked), baked_xml(path, baked, Path(folder) / "baked.xml")
+        theirs = peer.load_xml(xml, width, height)
+        return _compare(name, scene, theirs, integrator, depth, tiles, ", ".join(notes), own_sky, arguments, progress)
+
+
+def _compare(name, scene, theirs, integrator, depth, tiles, note, own_sky, arguments, progress) -> Row:
+    film = scene.film
     seed = {"calls": 0}
 
     def our_source(spp):
@@ -154,7 +178,7 @@ def compare_scene(path: Path, arguments: argparse.Namespace, progress) -> Row:
         seed["calls"] += 1
         return their_batches(theirs, depth, spp, seed["calls"] << 10, integrator)
 
-    progress(f"{name}: {width}x{height}, depth {depth}: warming up")
+    progress(f"{name}: {film.width}x{film.height}, depth {depth}: warming up")
     sides = [
         Side(make(spp), spp, tiles)
         for make in (our_source, their_source)
@@ -177,6 +201,7 @@ def compare_scene(path: Path, arguments: argparse.Namespace, progress) -> Row:
         note,
         comparison,
         (ours.image, peers.image),
+        own_sky,
         (ours.samples, peers.samples),
         (ours.seconds, peers.seconds),
     )
@@ -204,16 +229,18 @@ def exposure_of(image: np.ndarray) -> float:
 
 
 def picture(row: Row) -> np.ndarray:
-    """Ours, Mitsuba's, and the tiles' differences, side by side, 8-bit [height, 3 width, 3]."""
+    """Ours, Mitsuba's, the tiles' differences, and ours with our own sky, side by side, 8-bit [height, 4 width, 3]."""
     exposure = exposure_of(row.images[1])
     views = [tone_map(image, exposure) for image in row.images]
-    return np.concatenate([*views, difference_picture(row.comparison, views[0].shape[:2])], axis=1)
+    views.append(difference_picture(row.comparison, views[0].shape[:2]))
+    views.append(np.full_like(views[0], 255) if row.own_sky is None else tone_map(row.own_sky, exposure))
+    return np.concatenate(views, axis=1)
 
 
 def sheet(rows: list[Row]) -> Image.Image:
     """All pictures, one scene below the other, scaled to one width."""
     pictures = [Image.fromarray(picture(row)) for row in rows]
-    width = max(p.width for p in pictures)
+    width = SHEET_WIDTH
     pictures = [p.resize((width, round(p.height * width / p.width)), Image.Resampling.LANCZOS) for p in pictures]
     result = Image.new("RGB", (width, sum(p.height for p in pictures)))
     top = 0
