@@ -116,8 +116,9 @@ def test_both_renderers_see_the_same_baked_light(folder, baked, theirs):
     assert abs(means[0] - means[1]) < 3.89 * np.hypot(errors[0], errors[1])
     assert max(errors[:2]) < 2.5e-3 * means[0]  # so that 1.4 % would be seen
     assert means[1] == pytest.approx(means[2], rel=1e-2)
-    np.testing.assert_allclose(image[:7], others[0][:7], rtol=2e-3)
-    np.testing.assert_allclose(image[:7], others[1][:7], rtol=5e-3)
+    for other in others:  # places in a pixel are random, and the sky differs by a tenth across one
+        np.testing.assert_allclose(image[:7], other[:7], rtol=1e-2)
+        np.testing.assert_allclose(image[:7].mean(axis=(0, 1)), other[:7].mean(axis=(0, 1)), rtol=1e-3)
 
 
 def test_parts_that_are_off(folder, tmp_path):

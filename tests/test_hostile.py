@@ -257,7 +257,7 @@ def test_spheres_that_no_ray_can_hit(sphere):
 def test_a_camera_too_far_away():
     scene = scene_of()
     scene.camera = d.Perspective(to_world=[d.TransformStep(translate=(0.0, 0.0, 1e30))])
-    with pytest.raises(SceneError, match=r"camera\.to_world: the camera is beyond 1e\+12 m"):
+    with pytest.raises(SceneError, match=r"camera\.to_world: the camera is beyond 1e\+13 m"):
         Renderer(scene)
 
 

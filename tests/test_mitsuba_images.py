@@ -181,7 +181,7 @@ def test_records_of_a_file(folder, name):
 
 
 # Of these Mitsuba has no counterpart.
-OURS_ALONE = ("light-sun", "material-oren-nayar")
+OURS_ALONE = ("light-sun", "light-sunsky", "material-oren-nayar")
 # Caustics and indirect light alone: 0.1 % would take hours.
 NOISY = ("door-ajar", "glass-caustic", "glossy-plates")
 

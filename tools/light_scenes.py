@@ -19,6 +19,7 @@ from wavefront.scene.description import (
     Sphere,
     Spot,
     Sun,
+    SunSky,
 )
 from wavefront.scene.images import write_exr
 
@@ -42,6 +43,7 @@ def scenes(folder: Path) -> dict[str, Scene]:
             ),
         ),
         "sun": _scene("a sun 6 degrees wide, with soft shadows", Sun(direction=down, angle=3.0, irradiance=3.0)),
+        "sunsky": _scene("a clear sky and its sun", SunSky(direction=down, sky_scale=2.0, sun_scale=2.0)),
     }
 
 

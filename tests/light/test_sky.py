@@ -53,15 +53,21 @@ def test_zenith_is_that_of_the_paper(turbidity, elevation):
 
 
 def test_perez_at_a_known_place():
-    """Turbidity 3, sun and view at 60 degrees from the zenith, 90 degrees of azimuth apart: by hand.
-
-    A..E of Y are -0.9269, -0.6387, 5.257, -2.2153, 0.1693; cos(gamma) = 1/4."""
+    """Turbidity 3, sun and view at 60 degrees from the zenith, 90 degrees of azimuth apart, so cos(gamma) = 1/4."""
+    coefficients = {  # A to E, by hand from the table of the paper
+        "Y": (-0.9269, -0.6387, 5.2570, -2.2153, 0.1693),
+        "x": (-0.3171, -0.1987, 0.2113, -1.0912, 0.0353),
+        "y": (-0.3109, -0.2758, 0.1865, -1.7860, 0.0202),
+    }
     sun = towards(30.0)
-    gamma = np.arccos(0.25)
-    f = (1 - 0.9269 * np.exp(-0.6387 / 0.5)) * (1 + 5.257 * np.exp(-2.2153 * gamma) + 0.1693 * 0.0625)
-    z = (1 - 0.9269 * np.exp(-0.6387)) * (1 + 5.257 * np.exp(-2.2153 * np.pi / 3) + 0.1693 * 0.25)
-    zenith, there = (radiance(w, 3.0, sun)[0] @ LUMINANCE for w in ((0.0, 0.0, 1.0), towards(30.0, 90.0)))
-    assert there / zenith == pytest.approx(f / z, rel=1e-4)
+    values = {}
+    for where, w in (("zenith", (0.0, 0.0, 1.0)), ("there", towards(30.0, 90.0))):
+        X, Y, Z = TO_XYZ @ radiance(w, 3.0, sun)[0]
+        values[where] = {"Y": Y, "x": X / (X + Y + Z), "y": Y / (X + Y + Z)}
+    for name, (a, b, c, d_, e) in coefficients.items():
+        f = (1 + a * np.exp(b / 0.5)) * (1 + c * np.exp(d_ * np.arccos(0.25)) + e * 0.0625)
+        z = (1 + a * np.exp(b)) * (1 + c * np.exp(d_ * np.pi / 3) + e * 0.25)
+        assert values["there"][name] / values["zenith"][name] == pytest.approx(f / z, rel=1e-4)
 
 
 def test_the_whole_range_is_finite_positive_and_symmetric():

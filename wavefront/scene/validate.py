@@ -69,8 +69,9 @@ def validate(
                     f"shapes[{i}].to_world", "a sphere can be scaled uniformly only; found different scales or a shear"
                 )
         matrix = _check_transform(scene.camera.to_world, "camera.to_world")
-        if matrix is not None and np.abs(matrix[:3, 3]).max() > LARGEST_COORDINATE:
-            _fail("camera.to_world", f"the camera is beyond {LARGEST_COORDINATE:g} m, where 32-bit rays hit nothing")
+        farthest = 10.0 * LARGEST_COORDINATE  # with room to see all of what may be there
+        if matrix is not None and np.abs(matrix[:3, 3]).max() > farthest:
+            _fail("camera.to_world", f"the camera is beyond {farthest:g} m, where 32-bit rays hit nothing")
         _check_emitters(scene)
         for i, aov in enumerate(scene.film.aovs):
             if aov in scene.film.aovs[:i]:
