@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from wavefront import Renderer
+from wavefront.bsdf.tables import PRINCIPLED_FRACTIONS
 from wavefront.scene import description as d
 from wavefront.scene.device import upload_scene
-from wavefront.scene.lookup import PRINCIPLED_FRACTIONS
 
 
 def with_bsdf(*bsdfs):

@@ -31,6 +31,7 @@ from wavefront.bsdf.tables import (
     KIND_ROUGH_DIELECTRIC,
     KIND_ROUGH_PLASTIC,
     KIND_THIN_DIELECTRIC,
+    PRINCIPLED_FRACTIONS,
     MaterialTables,
     PrincipledRecord,
 )
@@ -84,24 +85,27 @@ def make_principled_at(textures: tuple[str, ...]):
     eval_parameter = make_eval_parameter(textures)
     eval_scalar = make_eval_scalar(textures)
 
-    @wp.func
-    def fraction(textures: TextureTables, value: float, texture: int, uv: wp.vec2) -> float:
-        return wp.clamp(eval_scalar(textures, value, texture, uv), 0.0, 1.0)
+    textured = bool(textures)
+    index = PRINCIPLED_FRACTIONS.index
 
     @wp.func
     def principled_at(r: PrincipledRecord, textures: TextureTables, uv: wp.vec2) -> PrincipledParameters:
         p = PrincipledParameters()
         p.base_color = eval_parameter(textures, r.base_color, r.base_color_texture, uv)
-        p.roughness = fraction(textures, r.roughness, r.roughness_texture, uv)
-        p.anisotropic = fraction(textures, r.anisotropic, r.anisotropic_texture, uv)
-        p.metallic = fraction(textures, r.metallic, r.metallic_texture, uv)
-        p.spec_trans = fraction(textures, r.spec_trans, r.spec_trans_texture, uv)
-        p.spec_tint = fraction(textures, r.spec_tint, r.spec_tint_texture, uv)
-        p.sheen = fraction(textures, r.sheen, r.sheen_texture, uv)
-        p.sheen_tint = fraction(textures, r.sheen_tint, r.sheen_tint_texture, uv)
-        p.flatness = fraction(textures, r.flatness, r.flatness_texture, uv)
-        p.clearcoat = fraction(textures, r.clearcoat, r.clearcoat_texture, uv)
-        p.clearcoat_gloss = fraction(textures, r.clearcoat_gloss, r.clearcoat_gloss_texture, uv)
+        f = r.fractions
+        if wp.static(textured):
+            for i in range(r.textured):  # one look-up in the code, however many parameters have a texture
+                f[r.textured_fraction[i]] = wp.clamp(eval_scalar(textures, 0.0, r.fraction_texture[i], uv), 0.0, 1.0)
+        p.roughness = f[wp.static(index("roughness"))]
+        p.anisotropic = f[wp.static(index("anisotropic"))]
+        p.metallic = f[wp.static(index("metallic"))]
+        p.spec_trans = f[wp.static(index("spec_trans"))]
+        p.spec_tint = f[wp.static(index("spec_tint"))]
+        p.sheen = f[wp.static(index("sheen"))]
+        p.sheen_tint = f[wp.static(index("sheen_tint"))]
+        p.flatness = f[wp.static(index("flatness"))]
+        p.clearcoat = f[wp.static(index("clearcoat"))]
+        p.clearcoat_gloss = f[wp.static(index("clearcoat_gloss"))]
         p.eta = r.eta
         p.specular_rate = r.specular_rate
         p.clearcoat_rate = r.clearcoat_rate

@@ -123,34 +123,37 @@ class PlasticRecord:
     first: wp.int32  # index into MaterialTables.coatings of the coating's transmittance
 
 
+# Parameters of a principled BSDF that are numbers from 0 to 1, or textures, in the order of a record.
+PRINCIPLED_FRACTIONS = (
+    "roughness",
+    "anisotropic",
+    "metallic",
+    "spec_trans",
+    "spec_tint",
+    "sheen",
+    "sheen_tint",
+    "flatness",
+    "clearcoat",
+    "clearcoat_gloss",
+)
+PrincipledFractions = wp.types.vector(length=len(PRINCIPLED_FRACTIONS), dtype=wp.float32)
+PrincipledTextures = wp.types.vector(length=len(PRINCIPLED_FRACTIONS), dtype=wp.int32)
+
+
 @wp.struct
 class PrincipledRecord:
+    """Only the fractions that have a texture are listed with one, so that what has none costs nothing to look up."""
+
     eta: wp.float32  # interior over exterior index of refraction
     specular_rate: wp.float32  # of sampling
     clearcoat_rate: wp.float32
     diffuse_rate: wp.float32
     base_color: wp.vec3
     base_color_texture: wp.int32
-    roughness: wp.float32
-    roughness_texture: wp.int32
-    anisotropic: wp.float32
-    anisotropic_texture: wp.int32
-    metallic: wp.float32
-    metallic_texture: wp.int32
-    spec_trans: wp.float32
-    spec_trans_texture: wp.int32
-    spec_tint: wp.float32
-    spec_tint_texture: wp.int32
-    sheen: wp.float32
-    sheen_texture: wp.int32
-    sheen_tint: wp.float32
-    sheen_tint_texture: wp.int32
-    flatness: wp.float32
-    flatness_texture: wp.int32
-    clearcoat: wp.float32
-    clearcoat_texture: wp.int32
-    clearcoat_gloss: wp.float32
-    clearcoat_gloss_texture: wp.int32
+    fractions: PrincipledFractions
+    textured: wp.int32  # how many fractions have a texture
+    textured_fraction: PrincipledTextures  # the first `textured`: which ones
+    fraction_texture: PrincipledTextures
 
 
 @wp.struct

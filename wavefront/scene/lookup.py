@@ -5,22 +5,10 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Iterator
 
+from wavefront.bsdf.tables import PRINCIPLED_FRACTIONS
 from wavefront.errors import SceneError
 from wavefront.scene import description
 
-# Fields of a principled BSDF that are numbers from 0 to 1, or textures.
-PRINCIPLED_FRACTIONS = (
-    "roughness",
-    "anisotropic",
-    "metallic",
-    "spec_trans",
-    "spec_tint",
-    "sheen",
-    "sheen_tint",
-    "flatness",
-    "clearcoat",
-    "clearcoat_gloss",
-)
 # Fields in which a string is the name of a texture.
 TEXTURE_FIELDS = frozenset(
     (

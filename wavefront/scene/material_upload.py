@@ -9,7 +9,7 @@ from wavefront.bsdf import tables as bsdf_tables
 from wavefront.bsdf.coating import diffuse_fresnel, rough_coating
 from wavefront.scene import description
 from wavefront.scene.ior import CONDUCTORS, INDEX_OF_REFRACTION
-from wavefront.scene.lookup import PRINCIPLED_FRACTIONS, resolve_bsdf, roughness
+from wavefront.scene.lookup import resolve_bsdf, roughness
 from wavefront.scene.texture_upload import TextureAtlas, struct_array
 
 DISTRIBUTIONS = {"ggx": 0, "beckmann": 1}
@@ -255,8 +255,15 @@ class MaterialUpload:
             record["diffuse_rate"] = bsdf.diffuse_reflectance_sampling_rate
             self._set(record, "base_color", bsdf.base_color, f"{where}.base_color")
             self.tangents |= bsdf.anisotropic != 0.0
-            for name in PRINCIPLED_FRACTIONS:
-                self._set(record, name, getattr(bsdf, name), f"{where}.{name}", scalar=True)
+            fractions = [
+                self.atlas.parameter(self.scene, getattr(bsdf, name), f"{where}.{name}", scalar=True)
+                for name in bsdf_tables.PRINCIPLED_FRACTIONS
+            ]
+            textured = [(i, texture) for i, (_, texture) in enumerate(fractions) if texture >= 0]
+            unused = [(0, -1)] * (len(fractions) - len(textured))
+            record["fractions"] = [value for value, _ in fractions]
+            record["textured"] = len(textured)
+            record["textured_fraction"], record["fraction_texture"] = zip(*textured, *unused, strict=True)
         else:
             table = "dielectric"
             record["eta"] = _relative_ior(bsdf)

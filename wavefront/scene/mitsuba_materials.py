@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from wavefront.bsdf.tables import PRINCIPLED_FRACTIONS
 from wavefront.errors import SceneError
 from wavefront.scene import description
-from wavefront.scene.lookup import PRINCIPLED_FRACTIONS
 from wavefront.scene.mitsuba_values import Element, to_number, to_numbers
 from wavefront.scene.mitsuba_xml import Document, Plugin
 
