@@ -5,11 +5,13 @@ import pytest
 from PIL import Image
 
 from tools import convert
+from tools.gltf_writer import GltfBuilder
 from tools.make_scenes import FOLDER as SCENES
 from wavefront import Renderer
 from wavefront.output import scene_hash
 from wavefront.scene import description as d
 from wavefront.scene import load_scene, meshes
+from wavefront.scene.mesh_files import read_mesh
 from wavefront.scene.mitsuba import UNLIMITED_DEPTH
 
 OBJ = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0.5\nvt 0.1 0.2\nvt 0.9 0.2\nvt 0.9 0.8\nf 1/1 2/2 3/3\nf 1/1 3/3 4/2\n"
@@ -144,6 +146,19 @@ def test_mitsuba_scene_converted_has_the_same_image(scene_file, tmp_path):
     images = [Renderer(load_scene(path), seed=5).render(4) for path in (scene_file, out)]
     assert (images[0] > 0.0).mean() > 0.1
     np.testing.assert_array_equal(*images)
+
+
+def test_meshes_are_written_as_they_are(tmp_path):
+    """To the last bit: normals of any length, and a triangle without area."""
+    rng = np.random.default_rng(8)
+    vertices, normals = rng.normal(size=(2, 5, 3)).astype(np.float32)
+    uvs, faces = rng.normal(size=(5, 2)).astype(np.float32), [(0, 1, 2), (2, 3, 4), (1, 1, 3)]
+    builder = GltfBuilder()
+    builder.scene(builder.add("nodes", mesh=builder.mesh(vertices, faces, normals, uvs), scale=[2, 1, 1]))
+    assert convert.main([str(builder.write(tmp_path / "a.glb")), str(tmp_path / "b.json"), "--quiet"]) == 0
+    found = read_mesh(str(tmp_path / "b_meshes" / "a.ply"))
+    for name, expected in (("vertices", vertices), ("faces", faces), ("normals", normals), ("uvs", uvs)):
+        np.testing.assert_array_equal(getattr(found, name), expected)
 
 
 @pytest.mark.parametrize("name", ["cornell-box", "material-diffuse-bitmap", "light-envmap", "material-twosided"])

@@ -315,10 +315,12 @@ def test_warnings(builder, tmp_path):
     builder.tree["animations"] = [{}]
     builder.add("skins", joints=[0])
     builder.scene(
-        builder.add("nodes", mesh=mesh, skin=0, weights=[0.5]), builder.add("nodes", mesh=mesh, scale=[0, 1, 1])
+        builder.add("nodes", mesh=mesh, skin=0, weights=[0.5]),
+        builder.add("nodes", mesh=mesh, scale=[0, 1, 1]),
+        builder.add("nodes", mesh=mesh, weights=[0.5]),  # what is left out of the mesh is said once
     )
     scene, warnings = load(builder, tmp_path)
-    assert len(scene.shapes) == 1
+    assert len(scene.shapes) == 2
     for words in (
         "extensionsUsed[0]: EXT_something is not supported and left out",
         "animations: animations are left out",

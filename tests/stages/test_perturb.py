@@ -7,7 +7,7 @@ from wavefront.bsdf import tables as bsdf
 from wavefront.stages.perturb import make_perturb
 
 NORMAL = unit([0.4, -0.2, 0.8])
-RECORD = {"kind": bsdf.MAPS["normal"], "normal": 0.5 * (NORMAL + 1.0), "texture": -1}
+RECORD = {"kind": bsdf.MAPS["normal"], "normal": 0.5 * (NORMAL + 1.0), "texture": -1, "scale": 1.0}
 
 
 def perturb(slots, material, direction, record=None, maps=None):

@@ -212,7 +212,10 @@ class _Writer:
             if isinstance(bsdf, description.NormalMap) and bsdf.scale != 1.0:
                 raise WavefrontError("Mitsuba's normalmap has no scale")
             if isinstance(bsdf, description.NormalMap):
-                return result | {"type": "normalmap", "normalmap": self._parameter(bsdf.normal, scalar=True)}
+                return result | {
+                    "type": "normalmap",
+                    "normalmap": self._parameter(bsdf.normal, scalar=not isinstance(bsdf.normal, list)),
+                }
             height = self._parameter(bsdf.height, scalar=True)
             return result | {"type": "bumpmap", "height": height, "scale": bsdf.scale}
         if isinstance(bsdf, description.Mask) and bsdf.cutoff is not None:
