@@ -214,7 +214,7 @@ class _Writer:
             }
         if isinstance(value, description.Bitmap):
             return self._bitmap(value, scalar)
-        return float(value) if scalar else _colour(value)
+        return float(value) if scalar and not isinstance(value, list) else _colour(value)
 
     def _bitmap(self, bitmap, scalar):
         is_float = bitmap.file.lower().endswith(".exr")
