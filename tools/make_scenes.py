@@ -277,7 +277,7 @@ def material_balls(folder: Path) -> dict[str, Scene]:
         "bump-map": (
             "a bowl of hammered copper, by a height field",
             BumpMap(
-                bsdf=TwoSided(front=RoughConductor(material="Cu", alpha_u=0.1, alpha_v=0.2)),
+                bsdf=TwoSided(front=RoughConductor(material="Cu", alpha=0.15)),
                 height=Bitmap(
                     file=str(folder / "textures" / "dents.png"), uv_transform=((4.0, 0.0, 0.0), (0.0, 2.0, 0.0))
                 ),
