@@ -387,12 +387,12 @@ def test_an_image_that_cannot_be_written_is_not_lost(whole, tmp_path, capsys, mo
     out = tmp_path / "out.exr"
     # The checkpoint that was asked for has all samples.
     options = ("--spp", SPP, "--quiet")
-    monkeypatch.setattr("wavefront.output.write_exr", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr("wavefront.output.write_exr_blocks", lambda *_, **__: 1 / 0)
 
     def fail(*_, **__):
         raise wavefront.WavefrontError(f"{out}: cannot be written: No space left on device")
 
-    monkeypatch.setattr("wavefront.output.write_exr", fail)
+    monkeypatch.setattr("wavefront.output.write_exr_blocks", fail)
     status, text = run(capsys, out, *options, "--checkpoint", tmp_path / "c")
     assert status == 2
     assert text == f"error: {out}: cannot be written: No space left on device; nothing is lost: --resume " + (

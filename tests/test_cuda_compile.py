@@ -83,7 +83,7 @@ def compile_for_cuda(features: Features, arch: int, folder) -> int:
 
 def compile_inspectors(f: Features, arch: int, folder) -> int:
     """The same for the kernels of a traced path."""
-    kernels = [make_inspect_hit(f.triangles, f.spheres)]
+    kernels = [make_inspect_hit(f.triangles, f.spheres, f.instances)]
     if f.light_sampling:
         kernels.append(make_inspect_light(f.lights, f.light_textures))
     return compile_modules([kernel.module for kernel in kernels], arch, folder)

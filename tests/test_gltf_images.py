@@ -12,7 +12,7 @@ from tools import convert
 from tools.gltf_scene import still_life
 from tools.gltf_writer import GltfBuilder, png
 from wavefront import Renderer, load_scene
-from wavefront.output import scene_hash
+from wavefront.identity import scene_records
 from wavefront.scene import description as d
 from wavefront.scene import json_format, meshes
 from wavefront.scene.images import write_png
@@ -142,7 +142,7 @@ def test_converted_scene_has_the_same_image(folder, still):
     np.testing.assert_array_equal(image(converted), expected)
     # converting what was converted changes nothing
     assert convert.main([str(folder / "converted.json"), str(folder / "again.json"), "--quiet"]) == 0
-    assert scene_hash(load_scene(folder / "again.json", SMALL)) == scene_hash(converted)
+    assert scene_records(load_scene(folder / "again.json", SMALL)) == scene_records(converted)
 
 
 def test_the_still_life_shows_what_it_is_made_of(still):

@@ -16,7 +16,8 @@ import wavefront
 from tests.test_aov import ALL, room
 from wavefront import Renderer
 from wavefront import film as film_module
-from wavefront.output import describe_render, scene_hash, write_outputs
+from wavefront.identity import scene_hash
+from wavefront.output import describe_render, write_outputs
 from wavefront.render import main, parse_crop
 from wavefront.scene import description as d
 from wavefront.scene import json_format

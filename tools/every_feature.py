@@ -28,6 +28,8 @@ def with_every_feature(scene: description.Scene) -> description.Scene:
     corners = camera + size * (5.0 * back + np.eye(3))
     emitters: dict[type, description.Emitter] = {type(emitter): emitter for emitter in scene.emitters}
     environment = any(isinstance(e, (description.Constant, description.Envmap)) for e in scene.emitters)
+    blend = description.Blend(first=description.Dielectric(), second=description.Diffuse())
+    scene.shapes.append(_triangle(corners, blend, None))  # of which there is no scene
     for file in sorted((ROOT / "scenes").glob("*.json")):
         donor = load_scene(file)
         for shape in donor.shapes:
