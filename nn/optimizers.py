@@ -1,0 +1,285 @@
+"""Optimisers: Adam and SGD, EMA and learning-rate decay around them, clipping, loss scaling, and skipped batches.
+
+One step is two kernels and nothing is read back: `measure` sums the squares of all gradients, `decide` turns them and
+the device's own state into the factors of this step, and `step` updates parameters, moments and average in one pass and
+clears the gradients. A batch with a gradient that is not finite changes nothing but its counter.
+
+Adam keeps a step count per parameter, as the schema's home does, so that an entry of a grid which is seldom met is
+corrected for its own few steps. Steps of the average and of the decay count whole batches.
+"""
+
+import functools
+import math
+
+import numpy as np
+import warp as wp
+
+from nn import config as c
+
+# Entries of the state.
+STEP, SKIPPED, LOSS_SCALE, GOOD_STEPS, LEARNING_RATE, GRADIENT_FACTOR, SKIP, EMA_OLD, EMA_NEW, NORM, LOW, HIGH = range(12)
+STATE_SIZE = 12
+N_RANGES = 64  # of gradients whose squares are summed apart; fixed, so that sums do not depend on threads
+GROWTH_INTERVAL = 2000.0
+LARGEST_LOSS_SCALE = 2.0**24
+SMALLEST_LOSS_SCALE = 2.0**-24
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Hyperparameters:
+    """What a step needs; see `nn.config`."""
+
+    learning_rate: wp.float32
+    beta1: wp.float32
+    beta2: wp.float32
+    epsilon: wp.float32
+    l2_reg: wp.float32
+    relative_decay: wp.float32
+    absolute_decay: wp.float32
+    adabound: wp.int32
+    clipping_magnitude: wp.float32
+    non_matrix_factor: wp.float32
+    optimize_matrix: wp.int32
+    optimize_non_matrix: wp.int32
+    l2_everywhere: wp.int32
+    n_matrix: wp.int32  # parameters before this index belong to matrices
+    n_corrections: wp.int32
+    ema_decay: wp.float32
+    decay_base: wp.float64
+    decay_start: wp.float64
+    decay_end: wp.float64
+    decay_interval: wp.float64
+    max_norm: wp.float64
+    dynamic_scale: wp.int32
+    adam: wp.int32
+
+
+@wp.kernel
+def measure(gradients: wp.array[wp.float32], first_range: int, sums: wp.array[wp.float64]):
+    """Sum of squares of a range of the gradients, not finite if one of them is not; one thread per range."""
+    part = first_range + wp.tid()
+    n = wp.int64(gradients.shape[0])
+    i = wp.int32(n * wp.int64(part) / wp.int64(N_RANGES))
+    end = wp.int32(n * wp.int64(part + 1) / wp.int64(N_RANGES))
+    a = wp.float64(0.0)
+    b = wp.float64(0.0)
+    while i + 1 < end:
+        g = wp.float64(gradients[i])
+        h = wp.float64(gradients[i + 1])
+        a += g * g
+        b += h * h
+        i += 2
+    if i < end:
+        g = wp.float64(gradients[i])
+        a += g * g
+    sums[part] = a + b
+
+
+@wp.kernel
+def decide(sums: wp.array[wp.float64], h: Hyperparameters, state: wp.array[wp.float64]):
+    """Advances the state by one batch; one thread."""
+    total = wp.float64(0.0)
+    for i in range(N_RANGES):
+        total += sums[i]
+    scale = state[LOSS_SCALE]
+    norm = wp.sqrt(total) / scale
+    state[NORM] = norm
+    if not wp.isfinite(total):
+        state[SKIP] = wp.float64(1.0)
+        state[SKIPPED] = state[SKIPPED] + wp.float64(1.0)
+        state[GOOD_STEPS] = wp.float64(0.0)
+        if h.dynamic_scale != 0:
+            state[LOSS_SCALE] = wp.max(scale * wp.float64(0.5), wp.float64(SMALLEST_LOSS_SCALE))
+        return
+    step = state[STEP]  # before this one
+    state[SKIP] = wp.float64(0.0)
+    rate = wp.float64(h.learning_rate)
+    one = wp.float64(1.0)
+    if h.decay_interval > wp.float64(0.0) and step >= h.decay_start:
+        last = wp.min(step, h.decay_end)
+        rate *= wp.pow(h.decay_base, wp.floor((last - h.decay_start) / h.decay_interval) + one)
+    state[LEARNING_RATE] = rate
+    factor = one / scale
+    if h.max_norm > wp.float64(0.0) and norm > h.max_norm:
+        factor *= h.max_norm / norm
+    state[GRADIENT_FACTOR] = factor
+    decay = wp.float64(h.ema_decay)
+    state[EMA_OLD] = decay * (one - wp.pow(decay, step)) / (one - wp.pow(decay, step + one))
+    state[EMA_NEW] = (one - decay) / (one - wp.pow(decay, step + one))
+    if h.adabound != 0:
+        t = (one - wp.float64(h.beta2)) * (step + one)
+        state[LOW] = wp.float64(0.1) - wp.float64(0.1) / (t + one)
+        state[HIGH] = wp.float64(0.1) + wp.float64(0.1) / t
+    state[STEP] = step + one
+    good = state[GOOD_STEPS] + one
+    if h.dynamic_scale != 0 and good >= wp.float64(GROWTH_INTERVAL):
+        state[LOSS_SCALE] = wp.min(scale * wp.float64(2.0), wp.float64(LARGEST_LOSS_SCALE))
+        good = wp.float64(0.0)
+    state[GOOD_STEPS] = good
+
+
+@functools.cache
+def make_step(adam: bool, ema: bool, elements: int):
+    """The update; each thread takes `elements` parameters. Arrays that the optimiser does without may be empty."""
+
+    @wp.kernel(enable_backward=False, module=f"nn.step_{int(adam)}{int(ema)}_{elements}")
+    def step(
+        h: Hyperparameters,
+        corrections: wp.array[wp.float32],
+        state: wp.array[wp.float64],
+        first: int,
+        # in and out
+        parameters: wp.array[wp.float32],
+        gradients: wp.array[wp.float32],
+        first_moments: wp.array[wp.float32],
+        second_moments: wp.array[wp.float32],
+        steps: wp.array[wp.int32],
+        averages: wp.array[wp.float32],
+    ):
+        begin = (first + wp.tid()) * wp.static(elements)
+        end = wp.min(begin + wp.static(elements), parameters.shape[0])
+        skip = state[SKIP] != wp.float64(0.0)
+        factor = wp.float32(state[GRADIENT_FACTOR])
+        base_rate = wp.float32(state[LEARNING_RATE])
+        ema_old = wp.float32(state[EMA_OLD])
+        ema_new = wp.float32(state[EMA_NEW])
+        for i in range(begin, end):
+            if skip:
+                gradients[i] = 0.0
+            else:
+                g = gradients[i]
+                matrix = i < h.n_matrix
+                update = h.optimize_matrix != 0
+                if not matrix:
+                    update = h.optimize_non_matrix != 0 and g != 0.0
+                    if wp.static(not adam):
+                        update = True
+                if update:
+                    w = parameters[i]
+                    g = g * factor
+                    gradients[i] = 0.0
+                    if matrix or h.l2_everywhere != 0:
+                        g += h.l2_reg * w
+                    if wp.static(adam):
+                        rate = base_rate
+                        if not matrix:
+                            rate = rate * h.non_matrix_factor
+                        m = h.beta1 * first_moments[i] + (1.0 - h.beta1) * g
+                        v = h.beta2 * second_moments[i] + (1.0 - h.beta2) * g * g
+                        first_moments[i] = m
+                        second_moments[i] = v
+                        t = steps[i]
+                        steps[i] = t + 1
+                        rate = rate * corrections[wp.min(t, h.n_corrections - 1)]
+                        own_rate = rate / (wp.sqrt(v) + h.epsilon)
+                        if h.adabound != 0:
+                            own_rate = wp.clamp(own_rate, wp.float32(state[LOW]), wp.float32(state[HIGH]))
+                        w = (1.0 - h.relative_decay * rate) * w - wp.sign(w) * (h.absolute_decay * rate)
+                        w = w - own_rate * m
+                        if h.clipping_magnitude > 0.0:
+                            w = wp.clamp(w, -h.clipping_magnitude, h.clipping_magnitude)
+                    else:
+                        w = w - base_rate * g
+                    parameters[i] = w
+                elif g != 0.0:
+                    gradients[i] = 0.0
+                if wp.static(ema):
+                    averages[i] = averages[i] * ema_old + parameters[i] * ema_new
+
+    return step
+
+
+def bias_corrections(beta1: float, beta2: float) -> np.ndarray:
+    """√(1 - beta2^t) / (1 - beta1^t) for t = 1 …, until it is 1 in float32 (the last entry holds from there on)."""
+    slowest = max(beta1, beta2)
+    n = 1 if slowest == 0 else min(max(math.ceil(math.log(1e-9) / math.log(slowest)), 1), 1 << 20)
+    t = np.arange(1, n + 1, dtype=np.float64)
+    return (np.sqrt(-np.expm1(t * _log(beta2))) / -np.expm1(t * _log(beta1))).astype(np.float32)
+
+
+def _log(beta):
+    return math.log(beta) if beta > 0 else -math.inf
+
+
+class Optimizer:
+    """An optimiser's state for `n_params` parameters.
+
+    Args:
+        cfg: The optimiser; wrappers may nest in any order, each at most once.
+        n_params: Parameters.
+        n_matrix: How many of them, from the first, belong to matrices.
+        loss_scale: A factor, or ``"dynamic"``.
+        max_norm: Of all gradients together; 0: no clipping.
+        device: Where the arrays live.
+    """
+
+    def __init__(self, cfg: c.Optimizer, n_params: int, n_matrix: int, loss_scale, max_norm: float, device):
+        h = Hyperparameters()
+        self.ema = False
+        while isinstance(cfg, (c.EMA, c.ExponentialDecay)):
+            if isinstance(cfg, c.EMA):
+                self.ema = True
+                h.ema_decay = cfg.decay
+            else:
+                h.decay_base, h.decay_interval = cfg.decay_base, cfg.decay_interval
+                h.decay_start, h.decay_end = cfg.decay_start, cfg.decay_end
+            cfg = cfg.nested
+        self.adam = isinstance(cfg, c.Adam)
+        h.learning_rate, h.l2_reg = cfg.learning_rate, cfg.l2_reg
+        h.n_matrix, h.optimize_matrix, h.optimize_non_matrix = n_matrix, 1, 1
+        h.l2_everywhere = int(not self.adam)
+        if self.adam:
+            h.beta1, h.beta2, h.epsilon = cfg.beta1, cfg.beta2, cfg.epsilon
+            h.relative_decay, h.absolute_decay = cfg.relative_decay, cfg.absolute_decay
+            h.adabound, h.clipping_magnitude = int(cfg.adabound), cfg.clipping_magnitude
+            h.non_matrix_factor = cfg.non_matrix_learning_rate_factor
+            h.optimize_matrix, h.optimize_non_matrix = int(cfg.optimize_matrix_params), int(cfg.optimize_non_matrix_params)
+        corrections = bias_corrections(cfg.beta1, cfg.beta2) if self.adam else np.ones(1, np.float32)
+        h.n_corrections, h.max_norm, h.dynamic_scale = len(corrections), max_norm, int(loss_scale == "dynamic")
+        self.hyperparameters, self.device, self.n_params = h, device, n_params
+        self.corrections = wp.array(corrections, dtype=wp.float32, device=device)
+        size = n_params if self.adam else 0
+        self.first_moments = wp.zeros(size, dtype=wp.float32, device=device)
+        self.second_moments = wp.zeros(size, dtype=wp.float32, device=device)
+        self.steps = wp.zeros(size, dtype=wp.int32, device=device)
+        self.averages = wp.zeros(n_params if self.ema else 0, dtype=wp.float32, device=device)
+        self.sums = wp.zeros(N_RANGES, dtype=wp.float64, device=device)
+        state = np.zeros(STATE_SIZE)
+        state[LOSS_SCALE] = 2.0**15 if loss_scale == "dynamic" else loss_scale
+        self.state = wp.array(state, dtype=wp.float64, device=device)
+        self.loss_scale = self.state[LOSS_SCALE : LOSS_SCALE + 1]
+        self.elements = 4096 if self.device.is_cpu else 1
+        self.kernel = make_step(self.adam, self.ema, self.elements)
+
+    def step(self, parameters: wp.array, gradients: wp.array, parallel) -> None:
+        """One update; `gradients` are zero afterwards. `parallel(launch, n)` spreads launches over threads."""
+        parallel(
+            lambda first, n, worker: wp.launch(
+                measure, dim=n, inputs=[gradients, first], outputs=[self.sums], device=self.device
+            ),
+            N_RANGES,
+        )
+        wp.launch(decide, dim=1, inputs=[self.sums, self.hyperparameters], outputs=[self.state], device=self.device)
+        arrays = [self.first_moments, self.second_moments, self.steps, self.averages]
+        parallel(
+            lambda first, n, worker: wp.launch(
+                self.kernel,
+                dim=n,
+                inputs=[self.hyperparameters, self.corrections, self.state, first],
+                outputs=[parameters, gradients, *arrays],
+                device=self.device,
+            ),
+            -(-self.n_params // self.elements),
+        )
+
+    def arrays(self) -> dict[str, wp.array]:
+        """Everything that a checkpoint holds."""
+        return {
+            "first_moments": self.first_moments,
+            "second_moments": self.second_moments,
+            "steps": self.steps,
+            "averages": self.averages,
+            "state": self.state,
+        }
