@@ -39,9 +39,7 @@ _GEMM = """
             for (int i = 0; i < 8; ++i)
                 #pragma unroll
                 for (int v = 0; v < V; ++v)
-                    acc[i][v] = accumulate ? *(const vec*)(C + (r + i) * c_stride + j + 16 * v)
-                              : has_bias   ? *(const vec*)(b.data + bias_offset + j + 16 * v)
-                                           : (vec)(0.0f);
+                    acc[i][v] = has_bias ? *(const vec*)(b.data + bias_offset + j + 16 * v) : (vec)(0.0f);
             const float* p = A + r * a_row;
             const float* q = B + j;
             for (int l = 0; l < k; ++l) {
@@ -62,6 +60,8 @@ _GEMM = """
                 #pragma unroll
                 for (int v = 0; v < V; ++v) {
                     vec y = acc[i][v];
+                    // sums of sums: rounding grows with the number of blocks, not of rows
+                    if (accumulate) y += *(const vec*)(C + (r + i) * c_stride + j + 16 * v);
                     if (epilogue == 1) y = y < 0.0f ? (vec)(0.0f) : y;
                     if (epilogue == 2) y = *(const vec*)(mask + (r + i) * c_stride + j + 16 * v) > 0.0f ? y : (vec)(0.0f);
                     *(vec*)(C + (r + i) * c_stride + j + 16 * v) = y;

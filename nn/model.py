@@ -18,7 +18,7 @@ from nn import optimizers
 from nn.cpu_mlp import BLOCK, CpuNetwork, infer, make_train_kernel
 from nn.cpu_mlp import add_chunks as add_chunks_kernel
 from nn.encodings import Encoding
-from nn.encodings.kernels import count_nonfinite_rows
+from nn.encodings.kernels import count_nonfinite_rows, gather_columns
 from nn.errors import ConfigError, NnError
 from nn.losses import make_loss
 from nn.mlp import MLP
@@ -85,6 +85,13 @@ class Model:
         self._buffers = Buffers(device)
         self._nonfinite = wp.zeros(threads, dtype=wp.int32, device=device)
         self._kept = None
+        self._load_modules(make_loss(cfg.loss.__struct_config__.tag))
+
+    def _load_modules(self, loss):
+        """Builds all kernels before threads could race for them."""
+        kernels = [infer, count_nonfinite_rows, optimizers.decide, self.optimizer.kernel, make_train_kernel(loss)]
+        kernels += [kernel for part in self.encoding.parts for kernel in part.kernels()]
+        wp.force_load(device=self.device, modules=list({kernel.module.name: kernel.module for kernel in kernels}.values()))
 
     @classmethod
     def from_config(
@@ -229,6 +236,7 @@ class Model:
         rows, encoded, flat, net, network = self._kept
         target = self._input(dL_dy, self.n_output_dims[network], "dL_dy")
         self._check_rows(target, rows)
+        wp.load_module(make_train_kernel(None).module, device=self.device)
         empty = wp.empty((0, 0), dtype=wp.float32, device=self.device)
         _, dL_dx = self._differentiate(rows, encoded, flat, {network: net}, None, {network: (target, empty)}, input_gradient)
         return None if dL_dx is None else self._like(dL_dx, dL_dy)
@@ -247,7 +255,9 @@ class Model:
         Returns:
             The loss: the mean over samples and outputs, summed over networks. A custom loss is normalised in the same way.
         """
-        loss = make_loss(self.config.loss.__struct_config__.tag) if loss is None else loss
+        if loss is None:
+            loss = make_loss(self.config.loss.__struct_config__.tag)
+        wp.load_module(make_train_kernel(loss).module, device=self.device)
         rows = self._input(x, self.n_input_dims, "x")
         n = rows.shape[0]
         several = isinstance(self.config.network, list)
@@ -291,6 +301,7 @@ class Model:
             rows = self._input(x, self.n_input_dims, "x")
             given = self._input(dL_dy, self.n_output_dims[0], "dL_dy")
             self._check_rows(given, rows)
+            wp.load_module(make_train_kernel(None).module, device=self.device)
             empty = wp.empty((0, 0), dtype=wp.float32, device=self.device)
             nets = {0: self._executions[0].pack(self.parameters)}
             with self._lend_encoded(rows.shape[0]) as (encoded, flat):
@@ -426,8 +437,6 @@ class Model:
         for i, part in enumerate(self.encoding.parts[:n_parts]):
             if latents and i in latents:
                 source, index = latents[i]
-                from nn.encodings.kernels import gather_columns
-
                 inputs = [source, index, row, part.n_features]
                 wp.launch(gather_columns, dim=end - row, inputs=inputs, outputs=[encoded, part.column], device=self.device)
             else:

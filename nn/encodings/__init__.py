@@ -45,11 +45,16 @@ class _Part:
 
 
 class _FixedPart(_Part):
-    """A part without parameters: a pair of kernels that take the same extra arguments."""
+    """A part without parameters: a pair of kernels, and their extra arguments."""
 
-    def __init__(self, cfg, n_dims, first_dim, column, n_features, forward, backward, extra):
+    def __init__(self, cfg, n_dims, first_dim, column, n_features, forward, backward, extra, backward_extra=None):
         super().__init__(cfg, n_dims, first_dim, column, n_features)
         self._forward, self._backward, self._extra = forward, backward, extra
+        self._backward_extra = extra if backward_extra is None else backward_extra
+
+    def kernels(self):
+        """All kernels that it launches."""
+        return [self._forward, self._backward]
 
     def forward(self, x, first_row, n_rows, first_dim, parameters, encoded, column):
         """Writes features of rows ``first_row … first_row + n_rows``."""
@@ -58,7 +63,7 @@ class _FixedPart(_Part):
 
     def backward_inputs(self, x, first_row, n_rows, parameters, dL_dencoded, dL_dx):
         """Adds the gradient with respect to the inputs of these rows."""
-        inputs = [x, first_row, self.first_dim, *self._extra, dL_dencoded, self.column]
+        inputs = [x, first_row, self.first_dim, *self._backward_extra, dL_dencoded, self.column]
         wp.launch(self._backward, dim=n_rows, inputs=inputs, outputs=[dL_dx], device=x.device)
 
 
@@ -74,6 +79,10 @@ class _GridPart(_Part):
         self._cpu = device.is_cpu
         self._kernels = make_cpu_grid_kernels(*kind) if self._cpu else make_grid_kernels(*kind)
         self._feature = wp.types.vector(cfg.n_features_per_level, wp.float32)
+
+    def kernels(self):
+        """All kernels that it launches."""
+        return list(self._kernels)
 
     def _view(self, parameters):
         """The entries of the grid among all parameters, or gradients."""
@@ -114,7 +123,7 @@ class _GridPart(_Part):
             return
         inputs = [x, self.first_dim, self.levels, dL_dencoded, self.column]
         wp.launch(
-            self._kernels[2], dim=(self.cfg.n_levels, n_rows), inputs=inputs, outputs=[view], device=x.device
+            self._kernels[1], dim=(self.cfg.n_levels, n_rows), inputs=inputs, outputs=[view], device=x.device
         )
 
     def backward_inputs(self, x, first_row, n_rows, parameters, dL_dencoded, dL_dx):
@@ -122,7 +131,7 @@ class _GridPart(_Part):
         rows = [first_row, first_row + n_rows] if self._cpu else [first_row]
         inputs = [x, *rows, self.first_dim, self.levels, self.cfg.n_levels, self._view(parameters)]
         wp.launch(
-            self._kernels[2 if self._cpu else 3],
+            self._kernels[2],
             dim=-(-n_rows // 64) if self._cpu else n_rows,
             inputs=[*inputs, dL_dencoded, self.column],
             outputs=[dL_dx],
@@ -153,7 +162,8 @@ def _make_part(cfg, n_dims, first_dim, column, path, device):
         per_dim, pair = cfg.n_frequencies, (k.triangle_wave_forward, k.triangle_wave_backward)
         extra = [cfg.n_frequencies]
     else:
-        per_dim, pair, extra = 1, (k.identity_forward, k.identity_backward), [cfg.scale, cfg.offset]
+        pair, extra = (k.identity_forward, k.identity_backward), [n_dims, cfg.scale, cfg.offset]
+        return _FixedPart(cfg, n_dims, first_dim, column, n_dims, *pair, extra, [n_dims, cfg.scale])
     return _FixedPart(cfg, n_dims, first_dim, column, per_dim * n_dims, *pair, [n_dims, *extra])
 
 

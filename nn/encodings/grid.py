@@ -94,13 +94,12 @@ def make_grid_kernels(n_dims: int, n_features: int, interpolation: str, hashed: 
         hashed: Some level may be a hash table.
 
     Returns:
-        forward, backward to parameters in order (one thread per level), backward to parameters by atomics (one thread
-        per level and row), backward to inputs.
+        forward and backward to parameters, which adds by atomics (one thread per level and row), and backward to inputs
+        (one thread per row).
     """
     corners = 1 if interpolation == "Nearest" else 1 << n_dims
     smooth = interpolation == "Smoothstep"
     Feature = wp.types.vector(n_features, wp.float32)
-    FeatureSum = wp.types.vector(n_features, wp.float64)
     Point = wp.types.vector(n_dims, wp.float32)
     Cell = wp.types.vector(n_dims, wp.uint32)
     kernel = wp.kernel(
@@ -223,50 +222,7 @@ def make_grid_kernels(n_dims: int, n_features: int, interpolation: str, hashed: 
         return g
 
     @kernel
-    def backward_in_order(
-        x: wp.array2d[wp.float32],
-        n_rows: int,
-        first_dim: int,
-        levels: Levels,
-        first_level: int,
-        dL_dencoded: wp.array2d[wp.float32],
-        column: int,
-        # out
-        dL_dfeatures: wp.array[Feature],
-    ):
-        """One thread per level. Consecutive rows of one cell are summed in float64 before they are added."""
-        level = first_level + wp.tid()
-        first_feature = column + level * wp.static(n_features)
-        scale = levels.scale[level]
-        row = int(0)
-        while row < n_rows:
-            place = find_place(levels, level, x, row, first_dim)
-            end = row + 1
-            while end < n_rows and find_cell(scale, x, end, first_dim) == place.cell:
-                end += 1
-            if end == row + 1:
-                g = upstream(dL_dencoded, row, first_feature)
-                t = faded(place)
-                for corner in range(wp.static(corners)):
-                    w = wp.float32(1.0)
-                    if wp.static(corners > 1):
-                        w = weight(t, corner)
-                    e = entry(place, corner)
-                    dL_dfeatures[e] = dL_dfeatures[e] + w * g
-            else:
-                for corner in range(wp.static(corners)):
-                    total = FeatureSum()
-                    for r in range(row, end):
-                        w = wp.float32(1.0)
-                        if wp.static(corners > 1):
-                            w = weight(faded(find_place(levels, level, x, r, first_dim)), corner)
-                        total += FeatureSum(w * upstream(dL_dencoded, r, first_feature))
-                    e = entry(place, corner)
-                    dL_dfeatures[e] = dL_dfeatures[e] + Feature(total)
-            row = end
-
-    @kernel
-    def backward_atomic(
+    def backward_parameters(
         x: wp.array2d[wp.float32],
         first_dim: int,
         levels: Levels,
@@ -318,4 +274,4 @@ def make_grid_kernels(n_dims: int, n_features: int, interpolation: str, hashed: 
         for d in range(wp.static(n_dims)):
             dL_dx[row, first_dim + d] = dL_dx[row, first_dim + d] + total[d]
 
-    return forward, backward_in_order, backward_atomic, backward_inputs
+    return forward, backward_parameters, backward_inputs

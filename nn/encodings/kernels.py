@@ -14,9 +14,9 @@ PI = wp.constant(wp.float32(3.14159265358979323846))
 
 
 @wp.func
-def fraction(x: wp.float32):
-    """x - floor(x), NaN for NaN and infinity."""
-    return x - wp.floor(x)
+def reduced(x: wp.float32):
+    """x less the nearest whole number, which is exact; NaN for NaN and infinity."""
+    return x - wp.rint(x)
 
 
 @wp.kernel
@@ -66,14 +66,14 @@ def frequency_forward(
 ):
     row = first_row + wp.tid()
     for d in range(n_dims):
-        # Half turns; taking them modulo a whole turn before every doubling is exact.
-        turn = fraction(x[row, first_dim + d] * 0.5)
+        # In turns; taking them modulo a whole turn before every doubling is exact.
+        turn = reduced(x[row, first_dim + d] * 0.5)
         for f in range(n_frequencies):
             angle = turn * (2.0 * PI)
             c = column + (d * n_frequencies + f) * 2
             encoded[row, c] = wp.sin(angle)
             encoded[row, c + 1] = wp.cos(angle)
-            turn = fraction(turn * 2.0)
+            turn = reduced(turn * 2.0)
 
 
 @wp.kernel
@@ -90,14 +90,14 @@ def frequency_backward(
 ):
     row = first_row + wp.tid()
     for d in range(n_dims):
-        turn = fraction(x[row, first_dim + d] * 0.5)
+        turn = reduced(x[row, first_dim + d] * 0.5)
         factor = wp.float32(PI)
         total = wp.float32(0.0)
         for f in range(n_frequencies):
             angle = turn * (2.0 * PI)
             c = column + (d * n_frequencies + f) * 2
             total += factor * (wp.cos(angle) * dL_dencoded[row, c] - wp.sin(angle) * dL_dencoded[row, c + 1])
-            turn = fraction(turn * 2.0)
+            turn = reduced(turn * 2.0)
             factor = factor * 2.0
         dL_dx[row, first_dim + d] = dL_dx[row, first_dim + d] + total
 
@@ -115,11 +115,12 @@ def triangle_wave_forward(
 ):
     row = first_row + wp.tid()
     for d in range(n_dims):
-        period = fraction(x[row, first_dim + d] * 0.5)
+        period = reduced(x[row, first_dim + d] * 0.5)
         for f in range(n_frequencies):
-            phase = fraction(period + 0.25 * wp.float32(f % 4))
+            phase = period + 0.25 * wp.float32(f % 4)
+            phase = phase - wp.floor(phase)
             encoded[row, column + d * n_frequencies + f] = wp.abs(phase - 0.5) * 4.0 - 1.0
-            period = fraction(period * 2.0)
+            period = reduced(period * 2.0)
 
 
 @wp.kernel
@@ -136,13 +137,14 @@ def triangle_wave_backward(
 ):
     row = first_row + wp.tid()
     for d in range(n_dims):
-        period = fraction(x[row, first_dim + d] * 0.5)
+        period = reduced(x[row, first_dim + d] * 0.5)
         slope = wp.float32(2.0)
         total = wp.float32(0.0)
         for f in range(n_frequencies):
-            phase = fraction(period + 0.25 * wp.float32(f % 4))
+            phase = period + 0.25 * wp.float32(f % 4)
+            phase = phase - wp.floor(phase)
             total += wp.where(phase < 0.5, -slope, slope) * dL_dencoded[row, column + d * n_frequencies + f]
-            period = fraction(period * 2.0)
+            period = reduced(period * 2.0)
             slope = slope * 2.0
         dL_dx[row, first_dim + d] = dL_dx[row, first_dim + d] + total
 
