@@ -34,7 +34,7 @@ _PREPARE = """
                 const bool near = __builtin_fabsf(whole) < 1073741824.0f;  // false for NaN
                 cell[d][i] = u32(static_cast<int>(near ? whole : 0.0f));
                 // The rounding of x · scale would be magnified by the differences between vertices.
-                const float f = __builtin_fmaf(v, scale, 0.5f - whole);
+                const float f = near ? __builtin_fmaf(v, scale, 0.5f - whole) : v - v;
                 p[d][i] = f;
                 t[d][i] = {SMOOTH} ? f * f * (3.0f - 2.0f * f) : f;
             }}

@@ -2,7 +2,7 @@
 
 Level l has scale s = base_resolution · per_level_scale^l - 1 and resolution ⌈s⌉ + 1. A point x lies at s x + 1/2 in
 units of cells: the half staggers the levels, and lets the last vertices of a dense level wrap around to its first
-ones. Outside the unit cube indices go on wrapping; a coordinate beyond 2^30 cells uses cell 0, and NaN stays NaN.
+ones. Outside the unit cube indices go on wrapping; a coordinate beyond 2^30 cells uses vertex 0, and NaN stays NaN.
 """
 
 import functools
@@ -137,7 +137,10 @@ def make_grid_kernels(n_dims: int, n_features: int, interpolation: str, hashed: 
         for d in range(wp.static(n_dims)):
             # The rounding of x · scale would be magnified by the differences between vertices.
             v = x[row, first_dim + d]
-            place.t[d] = fused_multiply_add(v, scale, 0.5 - wp.floor(v * scale + 0.5))
+            whole = wp.floor(v * scale + 0.5)
+            place.t[d] = v - v
+            if wp.abs(whole) < 1073741824.0:
+                place.t[d] = fused_multiply_add(v, scale, 0.5 - whole)
             factor = levels.stride[level, d]
             if wp.static(hashed):
                 if place.hashed:

@@ -158,14 +158,14 @@ def quartic_cdf(u: wp.float32):
 
 @wp.func
 def blob_cdf(u: wp.float32):
-    """Integral of the blob up to u, and of its two neighbours one unit away on a circle of `n_bins` (u in bins)."""
-    return quartic_cdf(wp.clamp(u, -1.0, 1.0)) + (u - u)  # the sum keeps NaN
+    """Integral of the blob up to u, in units of bins."""
+    return quartic_cdf(wp.clamp(u, -1.0, 1.0))
 
 
 @wp.func
 def blob_pdf(u: wp.float32):
     t = wp.max(1.0 - u * u, 0.0)
-    return 0.9375 * t * t + (u - u)
+    return 0.9375 * t * t
 
 
 @wp.kernel
@@ -182,12 +182,14 @@ def one_blob_forward(
     row = first_row + wp.tid()
     n = wp.float32(n_bins)
     for d in range(n_dims):
-        u = -x[row, first_dim + d] * n
+        v = x[row, first_dim + d]
+        u = -v * n
+        keep = v - v  # NaN for what is not finite, which the clamp would hide
         left = blob_cdf(u) + blob_cdf(u - n) + blob_cdf(u + n)
         for k in range(n_bins):
-            v = u + wp.float32(k + 1)
-            right = blob_cdf(v) + blob_cdf(v - n) + blob_cdf(v + n)
-            encoded[row, column + d * n_bins + k] = right - left
+            b = u + wp.float32(k + 1)
+            right = blob_cdf(b) + blob_cdf(b - n) + blob_cdf(b + n)
+            encoded[row, column + d * n_bins + k] = right - left + keep
             left = right
 
 
@@ -210,8 +212,8 @@ def one_blob_backward(
         left = blob_pdf(u) + blob_pdf(u - n) + blob_pdf(u + n)
         total = wp.float32(0.0)
         for k in range(n_bins):
-            v = u + wp.float32(k + 1)
-            right = blob_pdf(v) + blob_pdf(v - n) + blob_pdf(v + n)
+            b = u + wp.float32(k + 1)
+            right = blob_pdf(b) + blob_pdf(b - n) + blob_pdf(b + n)
             total += (left - right) * dL_dencoded[row, column + d * n_bins + k]
             left = right
         dL_dx[row, first_dim + d] = dL_dx[row, first_dim + d] + total * n
