@@ -115,6 +115,18 @@ def add_column_sums(
 ): ...
 
 
+@wp.func_native("""
+    for (int r = 0; r < rows; ++r) {
+        const float* from = scratch.data + offset + r * stride;
+        float* to = y.data + size_t(row + r) * y.shape[1];
+        for (int i = 0; i < y.shape[1]; ++i) to[i] = from[i];
+    }
+""")
+def write_rows(
+    scratch: wp.array[wp.float32], offset: int, stride: int, rows: int, row: int, y: wp.array2d[wp.float32]
+): ...
+
+
 @wp.struct
 class Network:
     """A network as the kernels read it."""
@@ -279,11 +291,7 @@ def infer(
     base = worker * net.scratch_size
     forward_block(net, encoded, wp.int64(row) * wp.int64(net.table[0, IN_PAD]), rows, scratch, base)
     last = net.table.shape[0] - 1
-    out = base + net.table[last, OUTPUT]
-    stride = net.table[last, OUT_PAD]
-    for r in range(rows):
-        for i in range(y.shape[1]):
-            y[row + r, i] = scratch[out + r * stride + i]
+    write_rows(scratch, base + net.table[last, OUTPUT], net.table[last, OUT_PAD], rows, row, y)
 
 
 @functools.cache
@@ -342,9 +350,8 @@ def make_train_kernel(loss):
                     total += wp.float64(
                         loss(scratch, out + r * stride, target, row + r, factor, scratch, gradient + r * stride)
                     )
-                    if y.shape[0] > 0:
-                        for i in range(n_out):
-                            y[row + r, i] = scratch[out + r * stride + i]
+            if y.shape[0] > 0:
+                write_rows(scratch, out, stride, rows, row, y)
             for i in range(rows * stride, (rows + 7) / 8 * 8 * stride):
                 scratch[gradient + i] = 0.0
             backward_block(

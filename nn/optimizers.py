@@ -43,7 +43,6 @@ class Hyperparameters:
     non_matrix_factor: wp.float32
     optimize_matrix: wp.int32
     optimize_non_matrix: wp.int32
-    l2_everywhere: wp.int32
     n_matrix: wp.int32  # parameters before this index belong to matrices
     n_corrections: wp.int32
     ema_decay: wp.float32
@@ -120,9 +119,93 @@ def decide(sums: wp.array[wp.float64], h: Hyperparameters, state: wp.array[wp.fl
     state[GOOD_STEPS] = good
 
 
+# One definition for both devices: a thread of CUDA takes one parameter, one of the CPU device thousands, in loops without
+# branches that the compiler turns into vector instructions.
+_STEP = """
+    float* __restrict__ P = parameters.data;
+    float* __restrict__ G = gradients.data;
+    float* __restrict__ M = first_moments.data;
+    float* __restrict__ V = second_moments.data;
+    int* __restrict__ T = steps.data;
+    float* __restrict__ E = averages.data;
+    const float* __restrict__ table = corrections.data;
+    if (state.data[{SKIP}] != 0.0) {{
+        for (int i = begin; i < end; ++i) G[i] = 0.0f;
+        return;
+    }}
+    const float factor = static_cast<float>(state.data[{GRADIENT_FACTOR}]);
+    const float base_rate = static_cast<float>(state.data[{LEARNING_RATE}]);
+    const float ema_old = static_cast<float>(state.data[{EMA_OLD}]);
+    const float ema_new = static_cast<float>(state.data[{EMA_NEW}]);
+    const float low = h.adabound ? static_cast<float>(state.data[{LOW}]) : 0.0f;
+    const float high = h.adabound ? static_cast<float>(state.data[{HIGH}]) : 3.4e38f;
+    const float limit = h.clipping_magnitude > 0.0f ? h.clipping_magnitude : 3.4e38f;
+    const float beta1 = h.beta1, beta2 = h.beta2, epsilon = h.epsilon, l2 = h.l2_reg, other_factor = h.non_matrix_factor;
+    const float relative = h.relative_decay, absolute = h.absolute_decay;
+    const int n_matrix = h.n_matrix, last = h.n_corrections - 1;
+    const int move_matrix = h.optimize_matrix, move_other = h.optimize_non_matrix;
+    for (int first = begin; first < end; first += 64) {{
+        const int past = first + 64 < end ? first + 64 : end;
+        int any = first < n_matrix || !{ADAM};
+        for (int i = first; i < past; ++i) any |= G[i] != 0.0f;
+        if (any)
+            for (int i = first; i < past; ++i) {{
+                const int matrix = i < n_matrix;
+                const float raw = G[i], w = P[i];
+                G[i] = 0.0f;
+                if ({ADAM}) {{
+                    const int moves = matrix ? move_matrix : move_other & (raw != 0.0f);
+                    const float g = raw * factor + (matrix ? l2 * w : 0.0f);
+                    const float m = beta1 * M[i] + (1.0f - beta1) * g;
+                    const float v = beta2 * V[i] + (1.0f - beta2) * g * g;
+                    const int t = T[i];
+                    const float rate = base_rate * (matrix ? 1.0f : other_factor) * table[t < last ? t : last];
+                    float own = rate / (SQUARE_ROOT(v) + epsilon);
+                    own = own < low ? low : own > high ? high : own;
+                    float next = (1.0f - relative * rate) * w - (w < 0.0f ? -absolute : absolute) * rate - own * m;
+                    next = next < -limit ? -limit : next > limit ? limit : next;
+                    M[i] = moves ? m : M[i];
+                    V[i] = moves ? v : V[i];
+                    T[i] = t + (moves ? 1 : 0);
+                    P[i] = moves ? next : w;
+                }} else {{
+                    P[i] = w - base_rate * (raw * factor + l2 * w);
+                }}
+            }}
+        if ({EMA})
+            for (int i = first; i < past; ++i) E[i] = E[i] * ema_old + P[i] * ema_new;
+    }}
+"""
+# The square root of the C library may set errno, which no vector instruction does.
+_SQUARE_ROOT = """
+#if defined(__CUDA_ARCH__)
+#define SQUARE_ROOT sqrtf
+#else
+#define SQUARE_ROOT __builtin_elementwise_sqrt
+#endif
+"""
+
+
 @functools.cache
 def make_step(adam: bool, ema: bool, elements: int):
     """The update; each thread takes `elements` parameters. Arrays that the optimiser does without may be empty."""
+    places = {"SKIP": SKIP, "GRADIENT_FACTOR": GRADIENT_FACTOR, "LEARNING_RATE": LEARNING_RATE, "EMA_OLD": EMA_OLD,
+              "EMA_NEW": EMA_NEW, "LOW": LOW, "HIGH": HIGH}  # fmt: skip
+
+    @wp.func_native(_SQUARE_ROOT + _STEP.format(**places, ADAM=int(adam), EMA=int(ema)))
+    def step_range(
+        begin: int,
+        end: int,
+        h: Hyperparameters,
+        corrections: wp.array[wp.float32],
+        state: wp.array[wp.float64],
+        parameters: wp.array[wp.float32],
+        gradients: wp.array[wp.float32],
+        first_moments: wp.array[wp.float32],
+        second_moments: wp.array[wp.float32],
+        steps: wp.array[wp.int32],
+        averages: wp.array[wp.float32],
+    ): ...
 
     @wp.kernel(enable_backward=False, module=f"nn.step_{int(adam)}{int(ema)}_{elements}")
     def step(
@@ -140,53 +223,9 @@ def make_step(adam: bool, ema: bool, elements: int):
     ):
         begin = (first + wp.tid()) * wp.static(elements)
         end = wp.min(begin + wp.static(elements), parameters.shape[0])
-        skip = state[SKIP] != wp.float64(0.0)
-        factor = wp.float32(state[GRADIENT_FACTOR])
-        base_rate = wp.float32(state[LEARNING_RATE])
-        ema_old = wp.float32(state[EMA_OLD])
-        ema_new = wp.float32(state[EMA_NEW])
-        for i in range(begin, end):
-            if skip:
-                gradients[i] = 0.0
-            else:
-                g = gradients[i]
-                matrix = i < h.n_matrix
-                update = h.optimize_matrix != 0
-                if not matrix:
-                    update = h.optimize_non_matrix != 0 and g != 0.0
-                    if wp.static(not adam):
-                        update = True
-                if update:
-                    w = parameters[i]
-                    g = g * factor
-                    gradients[i] = 0.0
-                    if matrix or h.l2_everywhere != 0:
-                        g += h.l2_reg * w
-                    if wp.static(adam):
-                        rate = base_rate
-                        if not matrix:
-                            rate = rate * h.non_matrix_factor
-                        m = h.beta1 * first_moments[i] + (1.0 - h.beta1) * g
-                        v = h.beta2 * second_moments[i] + (1.0 - h.beta2) * g * g
-                        first_moments[i] = m
-                        second_moments[i] = v
-                        t = steps[i]
-                        steps[i] = t + 1
-                        rate = rate * corrections[wp.min(t, h.n_corrections - 1)]
-                        own_rate = rate / (wp.sqrt(v) + h.epsilon)
-                        if h.adabound != 0:
-                            own_rate = wp.clamp(own_rate, wp.float32(state[LOW]), wp.float32(state[HIGH]))
-                        w = (1.0 - h.relative_decay * rate) * w - wp.sign(w) * (h.absolute_decay * rate)
-                        w = w - own_rate * m
-                        if h.clipping_magnitude > 0.0:
-                            w = wp.clamp(w, -h.clipping_magnitude, h.clipping_magnitude)
-                    else:
-                        w = w - base_rate * g
-                    parameters[i] = w
-                elif g != 0.0:
-                    gradients[i] = 0.0
-                if wp.static(ema):
-                    averages[i] = averages[i] * ema_old + parameters[i] * ema_new
+        step_range(
+            begin, end, h, corrections, state, parameters, gradients, first_moments, second_moments, steps, averages
+        )  # fmt: skip
 
     return step
 
@@ -229,7 +268,6 @@ class Optimizer:
         self.adam = isinstance(cfg, c.Adam)
         h.learning_rate, h.l2_reg = cfg.learning_rate, cfg.l2_reg
         h.n_matrix, h.optimize_matrix, h.optimize_non_matrix = n_matrix, 1, 1
-        h.l2_everywhere = int(not self.adam)
         if self.adam:
             h.beta1, h.beta2, h.epsilon = cfg.beta1, cfg.beta2, cfg.epsilon
             h.relative_decay, h.absolute_decay = cfg.relative_decay, cfg.absolute_decay

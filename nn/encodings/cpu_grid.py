@@ -30,11 +30,13 @@ _PREPARE = """
         for (int d = 0; d < D; ++d)
             for (int i = 0; i < B; ++i) {{
                 const float v = p[d][i];
-                const float whole = __builtin_floorf(v * scale + 0.5f);
+                float whole = __builtin_floorf(v * scale + 0.5f);
                 const bool near = __builtin_fabsf(whole) < 1073741824.0f;  // false for NaN
+                // The rounding of x · scale would be magnified by the differences between vertices, or miss the cell.
+                float f = __builtin_fmaf(v, scale, 0.5f - whole);
+                whole += f < 0.0f ? -1.0f : f >= 1.0f ? 1.0f : 0.0f;
+                f = near ? __builtin_fmaf(v, scale, 0.5f - whole) : v - v;
                 cell[d][i] = u32(static_cast<int>(near ? whole : 0.0f));
-                // The rounding of x · scale would be magnified by the differences between vertices.
-                const float f = near ? __builtin_fmaf(v, scale, 0.5f - whole) : v - v;
                 p[d][i] = f;
                 t[d][i] = {SMOOTH} ? f * f * (3.0f - 2.0f * f) : f;
             }}

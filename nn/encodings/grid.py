@@ -108,7 +108,6 @@ def make_grid_kernels(n_dims: int, n_features: int, interpolation: str, hashed: 
 
     @wp.struct
     class Place:
-        cell: Cell
         low: Cell  # index term of the lower vertex, per dimension
         high: Cell
         t: Point  # position in the cell, 0 to 1
@@ -117,30 +116,25 @@ def make_grid_kernels(n_dims: int, n_features: int, interpolation: str, hashed: 
         hashed: wp.bool
 
     @wp.func
-    def find_cell(scale: wp.float32, x: wp.array2d[wp.float32], row: int, first_dim: int):
-        cell = Cell()
-        for d in range(wp.static(n_dims)):
-            p = wp.floor(x[row, first_dim + d] * scale + 0.5)
-            if wp.abs(p) < 1073741824.0:  # false for NaN
-                cell[d] = wp.uint32(wp.int32(p))
-        return cell
-
-    @wp.func
     def find_place(levels: Levels, level: int, x: wp.array2d[wp.float32], row: int, first_dim: int):
         scale = levels.scale[level]
         place = Place()
         place.size = levels.size[level]
         place.offset = levels.offset[level]
-        place.cell = find_cell(scale, x, row, first_dim)
         if wp.static(hashed):
             place.hashed = levels.hashed[level] != 0
         for d in range(wp.static(n_dims)):
-            # The rounding of x · scale would be magnified by the differences between vertices.
+            # The rounding of x · scale would be magnified by the differences between vertices, or miss the cell.
             v = x[row, first_dim + d]
             whole = wp.floor(v * scale + 0.5)
-            place.t[d] = v - v
-            if wp.abs(whole) < 1073741824.0:
-                place.t[d] = fused_multiply_add(v, scale, 0.5 - whole)
+            t = v - v
+            cell = wp.uint32(0)
+            if wp.abs(whole) < 1073741824.0:  # false for NaN
+                t = fused_multiply_add(v, scale, 0.5 - whole)
+                whole += wp.where(t < 0.0, -1.0, wp.where(t >= 1.0, 1.0, 0.0))
+                t = fused_multiply_add(v, scale, 0.5 - whole)
+                cell = wp.uint32(wp.int32(whole))
+            place.t[d] = t
             factor = levels.stride[level, d]
             if wp.static(hashed):
                 if place.hashed:
@@ -151,8 +145,8 @@ def make_grid_kernels(n_dims: int, n_features: int, interpolation: str, hashed: 
                         factor = wp.uint32(805459861)
                     if d == 3:
                         factor = wp.uint32(3674653429)
-            place.low[d] = place.cell[d] * factor
-            place.high[d] = (place.cell[d] + wp.uint32(1)) * factor
+            place.low[d] = cell * factor
+            place.high[d] = (cell + wp.uint32(1)) * factor
         return place
 
     @wp.func

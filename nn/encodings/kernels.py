@@ -19,6 +19,34 @@ def reduced(x: wp.float32):
     return x - wp.rint(x)
 
 
+@wp.func_native("""
+    const float* from = x.data + size_t(row) * x.shape[1] + first_dim;
+    float* to = encoded.data + size_t(row) * encoded.shape[1] + column;
+    for (int d = 0; d < n_dims; ++d) to[d] = from[d] * scale + offset;
+""")
+def scale_row(
+    x: wp.array2d[wp.float32],
+    row: int,
+    first_dim: int,
+    n_dims: int,
+    scale: wp.float32,
+    offset: wp.float32,
+    encoded: wp.array2d[wp.float32],
+    column: int,
+): ...
+
+
+@wp.func_native("""
+    const unsigned int* bits = (const unsigned int*)(x.data + size_t(row) * x.shape[1]);
+    int bad = 0;
+    for (int d = 0; d < n_dims; ++d) bad |= (bits[d] & 0x7f800000u) == 0x7f800000u;
+    return bad;
+""")
+def has_nonfinite(x: wp.array2d[wp.float32], row: int, n_dims: int) -> int:
+    """1 if an entry of the row is infinite or NaN."""
+    ...
+
+
 @wp.kernel
 def identity_forward(
     x: wp.array2d[wp.float32],
@@ -31,9 +59,7 @@ def identity_forward(
     encoded: wp.array2d[wp.float32],
     column: int,
 ):
-    row = first_row + wp.tid()
-    for d in range(n_dims):
-        encoded[row, column + d] = x[row, first_dim + d] * scale + offset
+    scale_row(x, first_row + wp.tid(), first_dim, n_dims, scale, offset, encoded, column)
 
 
 @wp.kernel
@@ -328,8 +354,5 @@ def gather_columns(
 
 @wp.kernel
 def count_nonfinite_rows(x: wp.array2d[wp.float32], first_row: int, n_dims: int, counter: wp.array[wp.int32], slot: int):
-    row = first_row + wp.tid()
-    for d in range(n_dims):
-        if not wp.isfinite(x[row, d]):
-            wp.atomic_add(counter, slot, 1)
-            return
+    if has_nonfinite(x, first_row + wp.tid(), n_dims) != 0:
+        wp.atomic_add(counter, slot, 1)

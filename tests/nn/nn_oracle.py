@@ -53,8 +53,7 @@ def encode_grid(cfg, x, table):
     table = table.reshape(-1, f)
     for scale, resolution, entries in grid_levels(cfg, n_dims):
         p = x * scale + 0.5
-        # which cell is decided in float32; at its border both answers agree up to rounding
-        cell = np.floor((x.astype(np.float32) * np.float32(scale) + np.float32(0.5)).astype(np.float64))
+        cell = np.floor(p)
         t = p - cell
         if cfg.interpolation == "Smoothstep":
             t = t * t * (3 - 2 * t)
