@@ -2,7 +2,8 @@
 
 Names of types (`otype` and the values of enumerations) are read without regard to case. ``HashGrid``, ``DenseGrid`` and
 ``TiledGrid`` stand for ``Grid`` with that `type`. Defaults are those of the schema's documentation. Our own keys are
-`bias` and `n_parts` of a network, a list of networks, and `precision`, `loss_scale` and `gradient_clipping` at the top level.
+`bias` and `n_parts` of a network, a list of networks, and `precision`, `loss_scale` and `gradient_clipping` at the top
+level.
 """
 
 from __future__ import annotations
@@ -182,7 +183,7 @@ class EMA(_Record, tag_field="otype", tag="EMA", frozen=True):
 
 
 class ExponentialDecay(_Record, tag_field="otype", tag="ExponentialDecay", frozen=True):
-    """Multiplies the learning rate by `decay_base` at `decay_start` and every `decay_interval` steps until `decay_end`."""
+    """Multiplies the learning rate by `decay_base` at `decay_start` and every `decay_interval` steps to `decay_end`."""
 
     nested: Optimizer
     decay_base: Positive = 0.1
@@ -264,9 +265,7 @@ def load(config: Mapping | str | os.PathLike | ModelConfig) -> ModelConfig:
         elif key in raw:
             raw[key] = _canonical(raw[key], key, key)
     if isinstance(raw.get("gradient_clipping"), Mapping):
-        raw["gradient_clipping"] = _check_keys(
-            dict(raw["gradient_clipping"]), GradientClipping, "gradient_clipping"
-        )
+        raw["gradient_clipping"] = _check_keys(dict(raw["gradient_clipping"]), GradientClipping, "gradient_clipping")
     try:
         return msgspec.convert(raw, ModelConfig)
     except msgspec.ValidationError as error:

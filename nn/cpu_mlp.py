@@ -1,8 +1,8 @@
 """Execution of an MLP on the CPU device: blocks of rows go through all layers within the cache.
 
 Rows are samples. A matrix product C = A·B keeps 8 rows × 32 columns of C in vector registers and reads A by scalars, so
-the forward pass (B = Wᵀ), the gradient of the inputs (B = W) and that of the weights (A = dL/dyᵀ, B = x) are one routine
-over row-major blocks without any transposition of samples. Columns are padded to 16 with zeros.
+the forward pass (B = Wᵀ), the gradient of the inputs (B = W) and that of the weights (A = dL/dyᵀ, B = x) are one
+routine over row-major blocks without any transposition of samples. Columns are padded to 16 with zeros.
 
 The sizes of a network are run-time tables, so all networks share the kernels. Only the CPU device can run them.
 """
@@ -11,16 +11,16 @@ from __future__ import annotations
 
 import functools
 
-import numpy as np
 import warp as wp
 
-from nn import activations
 from nn.activations import RELU, activate, derivative
-from nn.mlp import MLP, pad
 
 BLOCK = 128  # rows; a multiple of 8
+N_CHUNKS = 16  # of a batch, whose weight gradients are summed in order: the same sums for any number of threads
 # Columns of the layer table.
-N_IN, IN_PAD, N_OUT, OUT_PAD, WT, W, BIAS, GRAD, ACTIVATION, OUTPUT, INPUT_OF_ACTIVATION, FROM_INPUT, HAS_BIAS = range(13)
+N_IN, IN_PAD, N_OUT, OUT_PAD, WT, W, BIAS, GRAD, ACTIVATION, OUTPUT, INPUT_OF_ACTIVATION, FROM_INPUT, HAS_BIAS = range(
+    13
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -63,7 +63,8 @@ _GEMM = """
                     // sums of sums: rounding grows with the number of blocks, not of rows
                     if (accumulate) y += *(const vec*)(C + (r + i) * c_stride + j + 16 * v);
                     if (epilogue == 1) y = y < 0.0f ? (vec)(0.0f) : y;
-                    if (epilogue == 2) y = *(const vec*)(mask + (r + i) * c_stride + j + 16 * v) > 0.0f ? y : (vec)(0.0f);
+                    if (epilogue == 2)
+                        y = *(const vec*)(mask + (r + i) * c_stride + j + 16 * v) > 0.0f ? y : (vec)(0.0f);
                     *(vec*)(C + (r + i) * c_stride + j + 16 * v) = y;
                 }
         }
@@ -164,30 +165,30 @@ def forward_block(
 ):
     """Activations of `rows` rows into the scratch at `base`; `first` is the offset of the first row of `encoded`."""
     m = (rows + 7) / 8 * 8
-    for l in range(net.table.shape[0]):
-        out_pad = net.table[l, OUT_PAD]
-        code = net.table[l, ACTIVATION]
-        out = base + net.table[l, OUTPUT]
+    for layer in range(net.table.shape[0]):
+        out_pad = net.table[layer, OUT_PAD]
+        code = net.table[layer, ACTIVATION]
+        out = base + net.table[layer, OUTPUT]
         target = out
-        if net.table[l, FROM_INPUT] != 0:
-            target = base + net.table[l, INPUT_OF_ACTIVATION]
+        if net.table[layer, FROM_INPUT] != 0:
+            target = base + net.table[layer, INPUT_OF_ACTIVATION]
         bias = int(-1)
-        if net.table[l, HAS_BIAS] != 0:
-            bias = net.table[l, BIAS]
+        if net.table[layer, HAS_BIAS] != 0:
+            bias = net.table[layer, BIAS]
         relu = wp.where(code == RELU, 1, 0)
-        k = net.table[l, N_IN]
-        wt = wp.int64(net.table[l, WT])
+        k = net.table[layer, N_IN]
+        wt = wp.int64(net.table[layer, WT])
         to = wp.int64(target)
-        if l == 0:
+        if layer == 0:
             multiply(
-                encoded, first, net.table[0, IN_PAD], 1, net.packed, wt, out_pad, bias, scratch, to, out_pad, m, out_pad,
-                k, 0, relu, scratch, to,
+                encoded, first, net.table[0, IN_PAD], 1, net.packed, wt, out_pad, bias, scratch, to, out_pad, m,
+                out_pad, k, 0, relu, scratch, to,
             )  # fmt: skip
         else:
-            before = wp.int64(base + net.table[l - 1, OUTPUT])
+            before = wp.int64(base + net.table[layer - 1, OUTPUT])
             multiply(
-                scratch, before, net.table[l, IN_PAD], 1, net.packed, wt, out_pad, bias, scratch, to, out_pad, m, out_pad,
-                k, 0, relu, scratch, to,
+                scratch, before, net.table[layer, IN_PAD], 1, net.packed, wt, out_pad, bias, scratch, to, out_pad, m,
+                out_pad, k, 0, relu, scratch, to,
             )  # fmt: skip
         if code > RELU:
             for i in range(m * out_pad):
@@ -219,42 +220,42 @@ def backward_block(
     if code != 0:
         multiply_by_derivative(net, n_layers - 1, m, scratch, base, current)
     for step in range(n_layers):
-        l = n_layers - 1 - step
-        in_pad = net.table[l, IN_PAD]
-        out_pad = net.table[l, OUT_PAD]
-        n_out = net.table[l, N_OUT]
-        grad = chunk + wp.int64(net.table[l, GRAD])
+        layer = n_layers - 1 - step
+        in_pad = net.table[layer, IN_PAD]
+        out_pad = net.table[layer, OUT_PAD]
+        n_out = net.table[layer, N_OUT]
+        grad = chunk + wp.int64(net.table[layer, GRAD])
         rows_of_w = (n_out + 7) / 8 * 8
-        if l == 0:
+        if layer == 0:
             multiply(
-                scratch, wp.int64(current), 1, out_pad, encoded, first, in_pad, -1, dL_dweights, grad, in_pad, rows_of_w,
-                in_pad, rows, 1, 0, scratch, wp.int64(0),
+                scratch, wp.int64(current), 1, out_pad, encoded, first, in_pad, -1, dL_dweights, grad, in_pad,
+                rows_of_w, in_pad, rows, 1, 0, scratch, wp.int64(0),
             )  # fmt: skip
         else:
-            x = wp.int64(base + net.table[l - 1, OUTPUT])
+            x = wp.int64(base + net.table[layer - 1, OUTPUT])
             multiply(
                 scratch, wp.int64(current), 1, out_pad, scratch, x, in_pad, -1, dL_dweights, grad, in_pad, rows_of_w,
                 in_pad, rows, 1, 0, scratch, wp.int64(0),
             )  # fmt: skip
-        if net.table[l, HAS_BIAS] != 0:
+        if net.table[layer, HAS_BIAS] != 0:
             add_column_sums(scratch, current, rows, out_pad, dL_dweights, grad + wp.int64(out_pad * in_pad))
-        w = wp.int64(net.table[l, W])
-        if l > 0:
-            code = net.table[l - 1, ACTIVATION]
-            x = wp.int64(base + net.table[l - 1, OUTPUT])
+        w = wp.int64(net.table[layer, W])
+        if layer > 0:
+            code = net.table[layer - 1, ACTIVATION]
+            x = wp.int64(base + net.table[layer - 1, OUTPUT])
             multiply(
                 scratch, wp.int64(current), out_pad, 1, net.packed, w, in_pad, -1, scratch, wp.int64(other), in_pad, m,
                 in_pad, n_out, 0, wp.where(code == RELU, 2, 0), scratch, x,
             )  # fmt: skip
             if code > RELU:
-                multiply_by_derivative(net, l - 1, m, scratch, base, other)
+                multiply_by_derivative(net, layer - 1, m, scratch, base, other)
             swap = current
             current = other
             other = swap
         elif want_input != 0:
             multiply(
-                scratch, wp.int64(current), out_pad, 1, net.packed, w, in_pad, -1, dL_dencoded, first, in_pad, m, in_pad,
-                n_out, wp.where(want_input == 2, 1, 0), 0, scratch, wp.int64(0),
+                scratch, wp.int64(current), out_pad, 1, net.packed, w, in_pad, -1, dL_dencoded, first, in_pad, m,
+                in_pad, n_out, wp.where(want_input == 2, 1, 0), 0, scratch, wp.int64(0),
             )  # fmt: skip
 
 
@@ -399,52 +400,6 @@ def add_chunks(
         gradients[where] = gradients[where] + wp.float32(total)
 
 
-class CpuNetwork:
-    """A network's tables on the CPU device.
-
-    Args:
-        mlp: The network.
-        offset: Of its first parameter among all.
-        stride: Of the rows of encoded features, a multiple of 16; columns beyond `mlp.n_in` are not read.
-        device: The CPU device.
-    """
-
-    def __init__(self, mlp: MLP, offset: int, stride: int, device):
-        self.mlp, self.device = mlp, device
-        table, offsets = [], []
-        packed = gradient = scratch = widest = 0
-        for layer in mlp.layers:
-            in_pad, out_pad = pad(layer.n_in) if table else stride, pad(layer.n_out)
-            row = {N_IN: layer.n_in, IN_PAD: in_pad, N_OUT: layer.n_out, OUT_PAD: out_pad}
-            row[WT] = packed
-            row[W] = packed + layer.n_in * out_pad
-            row[BIAS] = row[W] + layer.n_out * in_pad
-            packed = row[BIAS] + out_pad
-            row[GRAD] = gradient
-            gradient += out_pad * in_pad + out_pad
-            row[ACTIVATION] = activations.CODES[layer.activation]
-            row[OUTPUT] = scratch
-            scratch += BLOCK * out_pad
-            row[FROM_INPUT] = int(layer.activation in activations.FROM_INPUT)
-            row[INPUT_OF_ACTIVATION] = scratch
-            scratch += BLOCK * out_pad * row[FROM_INPUT]
-            row[HAS_BIAS] = int(layer.bias >= 0)
-            widest = max(widest, in_pad, out_pad)
-            table.append([row[key] for key in range(13)])
-            offsets.append([offset + layer.weight, offset + layer.bias])
-        self.table = wp.array(np.array(table, np.int32), dtype=wp.int32, device=device)
-        self.offsets = wp.array(np.array(offsets, np.int32), dtype=wp.int32, device=device)
-        self.packed_size, self.gradient_size = packed, gradient
-        self.gradient, self.gradient_stride = scratch, BLOCK * widest
-        self.scratch_size = scratch + 2 * BLOCK * widest
-
-    def pack(self, parameters: wp.array) -> Network:
-        """The network with these parameters (a copy of them)."""
-        net = Network()
-        net.table = self.table
-        net.packed = wp.zeros(self.packed_size, dtype=wp.float32, device=self.device)
-        net.scratch_size, net.gradient_size = self.scratch_size, self.gradient_size
-        net.gradient, net.gradient_stride = self.gradient, self.gradient_stride
-        for i, layer in enumerate(self.mlp.layers):
-            wp.launch(pack, dim=layer.n_out, inputs=[parameters, self.offsets, i, net], device=self.device)
-        return net
+def n_blocks(n: int) -> int:
+    """Blocks that hold `n` rows."""
+    return -(-n // BLOCK)

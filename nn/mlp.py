@@ -7,6 +7,7 @@ other. A network has no notion of a device; `nn.cpu_mlp` executes it.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 
@@ -48,7 +49,7 @@ class MLP:
         """Layers in order."""
         widths = [self.n_in] + [self.cfg.n_neurons] * self.cfg.n_hidden_layers + [self.n_out]
         layers, offset = [], 0
-        for i, (n_in, n_out) in enumerate(zip(widths[:-1], widths[1:], strict=True)):
+        for i, (n_in, n_out) in enumerate(itertools.pairwise(widths)):
             last = i == len(widths) - 2
             layers.append(
                 Layer(

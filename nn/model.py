@@ -14,9 +14,11 @@ import numpy as np
 import warp as wp
 
 from nn import config as c
+from nn import cpu_mlp as execute
 from nn import optimizers
-from nn.cpu_mlp import BLOCK, CpuNetwork, infer, make_train_kernel
-from nn.cpu_mlp import add_chunks as add_chunks_kernel
+from nn.arrays import Array, as_index, as_input, as_output, check_rows, empty
+from nn.cpu_mlp import BLOCK, make_train_kernel, n_blocks
+from nn.cpu_network import CpuNetwork
 from nn.encodings import Encoding
 from nn.encodings.kernels import count_nonfinite_rows, gather_columns
 from nn.errors import ConfigError, NnError
@@ -24,10 +26,7 @@ from nn.losses import make_loss
 from nn.mlp import MLP
 from nn.workers import Buffers, Workers, available_cores
 
-N_CHUNKS = 16  # of a batch, whose weight gradients are summed in order: the same sums for any number of threads
 _ALIGNMENT = 8  # of a grid's first parameter, in floats
-
-Array = np.ndarray | wp.array
 
 
 class Model:
@@ -40,7 +39,9 @@ class Model:
         n_matrix_params: How many parameters, from the first, belong to networks.
     """
 
-    def __init__(self, cfg: c.ModelConfig, n_input_dims: int, n_output_dims: Sequence[int], device, seed: int, threads: int):
+    def __init__(
+        self, cfg: c.ModelConfig, n_input_dims: int, n_output_dims: Sequence[int], device, seed: int, threads: int
+    ):
         self.config, self.device = cfg, device
         self.n_input_dims, self.n_output_dims = n_input_dims, list(n_output_dims)
         if cfg.precision != "fp32":
@@ -89,9 +90,17 @@ class Model:
 
     def _load_modules(self, loss):
         """Builds all kernels before threads could race for them."""
-        kernels = [infer, count_nonfinite_rows, optimizers.decide, self.optimizer.kernel, make_train_kernel(loss)]
+        kernels = [
+            execute.infer,
+            count_nonfinite_rows,
+            optimizers.decide,
+            self.optimizer.kernel,
+            make_train_kernel(loss),
+        ]
         kernels += [kernel for part in self.encoding.parts for kernel in part.kernels()]
-        wp.force_load(device=self.device, modules=list({kernel.module.name: kernel.module for kernel in kernels}.values()))
+        wp.force_load(
+            device=self.device, modules=list({kernel.module.name: kernel.module for kernel in kernels}.values())
+        )
 
     @classmethod
     def from_config(
@@ -123,7 +132,9 @@ class Model:
         several = isinstance(cfg.network, list)
         dims = list(n_output_dims) if isinstance(n_output_dims, Sequence) else [n_output_dims]
         if several and len(dims) != len(cfg.network):
-            raise ConfigError("network", f"found {len(cfg.network)} networks and {len(dims)} numbers of output dimensions")
+            raise ConfigError(
+                "network", f"found {len(cfg.network)} networks and {len(dims)} numbers of output dimensions"
+            )
         if (not several and len(dims) != 1) or any(not isinstance(n, (int, np.integer)) or n < 1 for n in dims):
             raise NnError(f"n_output_dims: found {n_output_dims}; allowed: a positive number for each network")
         if not isinstance(n_input_dims, (int, np.integer)) or n_input_dims < 1:
@@ -160,22 +171,31 @@ class Model:
             Outputs ``[n, n_output_dims]``.
         """
         parameters = self.inference_parameters if averaged else self.parameters
-        rows = self._input(x, self.n_input_dims, "x")
-        y, given = self._output(out, rows.shape[0], self.n_output_dims[network], x)
-        latents = {self._part_index(part): self._latent(part, *pair, rows.shape[0]) for part, pair in (latents or {}).items()}
-        execution = self._executions[network]
-        net = execution.pack(parameters)
-        n_parts = self.networks[network].cfg.n_parts or len(self.encoding.parts)
-        with self._lend_encoded(rows.shape[0]) as (encoded, flat), self._lend_scratch(network) as scratch:
-
-            def work(first, n, worker):
-                row, end = first * BLOCK, min((first + n) * BLOCK, rows.shape[0])
-                self._encode(rows, row, end, worker, parameters, encoded, latents, n_parts)
-                inputs = [flat, row, end, net, worker, scratch]
-                wp.launch(infer, dim=n, inputs=inputs, outputs=[y], device=self.device)
-
-            self._workers.run(work, self._n_blocks(rows.shape[0]), 16)
+        rows = as_input(x, self.n_input_dims, "x", self.device)
+        y, given = as_output(out, rows.shape[0], self.n_output_dims[network], x, self.device)
+        found = {}
+        for part, (latent, index) in (latents or {}).items():
+            piece, name = self.encoding.parts[self._part_index(part)], f"latents[{part}]"
+            latent = as_input(latent, piece.n_features, name, self.device)
+            found[part] = (latent, as_index(index, rows.shape[0], latent.shape[0], name, self.device))
+        with self._lend_encoded(rows.shape[0]) as flat:
+            self._evaluate(rows, flat, parameters, network, y, found)
         return given
+
+    def _evaluate(self, rows, flat, parameters, network, y, latents=None):
+        """Outputs of a network into `y`, and features into `flat`; returns the packed network."""
+        execution, n, encoded = self._executions[network], rows.shape[0], self._as_rows(flat)
+        net = execution.pack(parameters)
+        n_parts = self.networks[network].cfg.n_parts if latents is not None else None
+        with execution.lend_scratch(self._workers, self._buffers) as scratch:
+
+            def work(first, count, worker):
+                row, end = first * BLOCK, min((first + count) * BLOCK, n)
+                self._encode(rows, row, end, worker, parameters, encoded, latents, n_parts)
+                execution.infer(net, flat, row, end, worker, scratch, y)
+
+            self._workers.run(work, n_blocks(n), 16)
+        return net
 
     def encode(self, part: int, x: Array, averaged: bool = True) -> Array:
         """Features of one part of the encoding, for `inference(latents=…)`.
@@ -189,43 +209,34 @@ class Model:
             ``[n, features of the part]``, of the kind of `x`.
         """
         piece = self.encoding.parts[self._part_index(part)]
-        rows = self._input(x, piece.n_dims, "x")
-        latent, given = self._output(None, rows.shape[0], piece.n_features, x)
+        rows = as_input(x, piece.n_dims, "x", self.device)
+        latent, given = as_output(None, rows.shape[0], piece.n_features, x, self.device)
         parameters = self.inference_parameters if averaged else self.parameters
 
         def work(first, n, worker):
             row, end = first * BLOCK, min((first + n) * BLOCK, rows.shape[0])
             piece.forward(rows, row, end - row, 0, parameters, latent, 0)
 
-        self._workers.run(work, self._n_blocks(rows.shape[0]), 16)
+        self._workers.run(work, n_blocks(rows.shape[0]), 16)
         return given
 
     # Training -------------------------------------------------------------------------------------------------------
 
     def forward(self, x: Array, network: int = 0) -> Array:
         """Evaluates a network with the parameters that are being trained, and remembers `x` for `backward`."""
-        rows = self._input(x, self.n_input_dims, "x")
-        y, given = self._output(None, rows.shape[0], self.n_output_dims[network], x)
+        rows = as_input(x, self.n_input_dims, "x", self.device)
+        y, given = as_output(None, rows.shape[0], self.n_output_dims[network], x, self.device)
         self._release()
-        encoded, flat = self._take_encoded(rows.shape[0])
-        net = self._executions[network].pack(self.parameters)
-        with self._lend_scratch(network) as scratch:
-
-            def work(first, n, worker):
-                row, end = first * BLOCK, min((first + n) * BLOCK, rows.shape[0])
-                self._encode(rows, row, end, worker, self.parameters, encoded)
-                inputs = [flat, row, end, net, worker, scratch]
-                wp.launch(infer, dim=n, inputs=inputs, outputs=[y], device=self.device)
-
-            self._workers.run(work, self._n_blocks(rows.shape[0]), 16)
-        self._kept = (rows, encoded, flat, net, network)
+        flat = self._buffers.take("encoded", self._encoded_size(rows.shape[0]))
+        net = self._evaluate(rows, flat, self.parameters, network, y)
+        self._kept = (rows, flat, net, network)
         return given
 
     def backward(self, dL_dy: Array, input_gradient: bool = False) -> Array | None:
         """Adds to `gradients` from the gradient of a loss with respect to the outputs of the last `forward`.
 
-        The activations of the hidden layers are computed again from the encoded features that `forward` kept. `dL_dy` is
-        multiplied by the loss scale here.
+        The activations of the hidden layers are computed again from the encoded features that `forward` kept. `dL_dy`
+        is multiplied by the loss scale here.
 
         Args:
             dL_dy: ``[n, n_output_dims]``.
@@ -233,13 +244,13 @@ class Model:
         """
         if self._kept is None:
             raise NnError("backward: there was no forward before it")
-        rows, encoded, flat, net, network = self._kept
-        target = self._input(dL_dy, self.n_output_dims[network], "dL_dy")
-        self._check_rows(target, rows)
+        rows, flat, net, network = self._kept
+        target = as_input(dL_dy, self.n_output_dims[network], "dL_dy", self.device)
+        check_rows(target, rows)
         wp.load_module(make_train_kernel(None).module, device=self.device)
-        empty = wp.empty((0, 0), dtype=wp.float32, device=self.device)
-        _, dL_dx = self._differentiate(rows, encoded, flat, {network: net}, None, {network: (target, empty)}, input_gradient)
-        return None if dL_dx is None else self._like(dL_dx, dL_dy)
+        nothing = empty((0, 0), self.device)
+        _, dL_dx = self._differentiate(rows, flat, {network: net}, None, {network: (target, nothing)}, input_gradient)
+        return dL_dx if dL_dx is None or isinstance(dL_dy, wp.array) else dL_dx.numpy()
 
     def compute_gradients(
         self, x: Array, target: Array | Sequence[Array], loss=None, outputs: Array | Sequence[Array] | None = None
@@ -253,25 +264,25 @@ class Model:
             outputs: Where to write the outputs, if they are wanted.
 
         Returns:
-            The loss: the mean over samples and outputs, summed over networks. A custom loss is normalised in the same way.
+            The loss: the mean over samples and outputs, summed over networks. A loss of one's own is normalised alike.
         """
         if loss is None:
             loss = make_loss(self.config.loss.__struct_config__.tag)
         wp.load_module(make_train_kernel(loss).module, device=self.device)
-        rows = self._input(x, self.n_input_dims, "x")
+        rows = as_input(x, self.n_input_dims, "x", self.device)
         n = rows.shape[0]
         several = isinstance(self.config.network, list)
         targets = list(target) if several else [target]
         written = (list(outputs) if several else [outputs]) if outputs is not None else [None] * len(self.networks)
         jobs = {}
         for i, (one, y) in enumerate(zip(targets, written, strict=True)):
-            one = self._input(one, self.n_output_dims[i], "target")
-            self._check_rows(one, rows)
-            y = self._output(y, n, self.n_output_dims[i], x)[0] if y is not None else None
-            jobs[i] = (one, wp.empty((0, 0), dtype=wp.float32, device=self.device) if y is None else y)
+            one = as_input(one, self.n_output_dims[i], "target", self.device)
+            check_rows(one, rows)
+            y = as_output(y, n, self.n_output_dims[i], x, self.device)[0] if y is not None else None
+            jobs[i] = (one, empty((0, 0), self.device) if y is None else y)
         nets = {i: execution.pack(self.parameters) for i, execution in enumerate(self._executions)}
-        with self._lend_encoded(n) as (encoded, flat):
-            return self._differentiate(rows, encoded, flat, nets, loss, jobs, False, encode=True)[0]
+        with self._lend_encoded(n) as flat:
+            return self._differentiate(rows, flat, nets, loss, jobs, False, encode=True)[0]
 
     def train_step(
         self,
@@ -298,14 +309,14 @@ class Model:
             value = self.compute_gradients(x, target, loss)
         else:
             value = None
-            rows = self._input(x, self.n_input_dims, "x")
-            given = self._input(dL_dy, self.n_output_dims[0], "dL_dy")
-            self._check_rows(given, rows)
+            rows = as_input(x, self.n_input_dims, "x", self.device)
+            given = as_input(dL_dy, self.n_output_dims[0], "dL_dy", self.device)
+            check_rows(given, rows)
             wp.load_module(make_train_kernel(None).module, device=self.device)
-            empty = wp.empty((0, 0), dtype=wp.float32, device=self.device)
+            nothing = empty((0, 0), self.device)
             nets = {0: self._executions[0].pack(self.parameters)}
-            with self._lend_encoded(rows.shape[0]) as (encoded, flat):
-                self._differentiate(rows, encoded, flat, nets, None, {0: (given, empty)}, False, encode=True)
+            with self._lend_encoded(rows.shape[0]) as flat:
+                self._differentiate(rows, flat, nets, None, {0: (given, nothing)}, False, encode=True)
         self.optimizer_step()
         return value
 
@@ -317,67 +328,42 @@ class Model:
         """Forgets the gradients."""
         self.gradients.zero_()
 
-    def _differentiate(self, rows, encoded, flat, nets, loss, jobs, input_gradient, encode=False):
+    def _differentiate(self, rows, flat, nets, loss, jobs, input_gradient, encode=False):
         """Adds all gradients; returns the loss and dL/dx or None."""
-        n = rows.shape[0]
+        n, value, dL_dx = rows.shape[0], 0.0, None
         want_features = input_gradient or self.encoding.n_params > 0
-        kernel = make_train_kernel(loss)
-        dL_dencoded, dL_dflat = self._take_encoded(n if want_features else 0, "dL_dencoded")
-        value = 0.0
-        last = list(nets)[-1]
-        for order, (i, net) in enumerate(nets.items()):
-            target, y = jobs[i]
-            execution = self._executions[i]
-            losses = wp.zeros(N_CHUNKS, dtype=wp.float64, device=self.device)
-            want = (2 if order else 1) if want_features else 0
-            size = N_CHUNKS * execution.gradient_size
-            with self._lend_scratch(i) as scratch, self._buffers.lend(("weights", i), size) as weights:
 
-                def work(first, count, worker, net=net, target=target, y=y, losses=losses, want=want, order=order,
-                         scratch=scratch, weights=weights):  # fmt: skip
-                    blocks = self._n_blocks(n)
-                    row = blocks * first // N_CHUNKS * BLOCK
-                    end = min(blocks * (first + count) // N_CHUNKS * BLOCK, n)
-                    if encode and order == 0 and end > row:
-                        self._encode(rows, row, end, worker, self.parameters, encoded)
-                    inputs = [flat, n, first, N_CHUNKS, net, worker, scratch, target, self.optimizer.loss_scale, want]
-                    wp.launch(
-                        kernel, dim=count, inputs=inputs, outputs=[y, losses, weights, dL_dflat], device=self.device
-                    )
+        def encode_rows(row, end, worker):
+            self._encode(rows, row, end, worker, self.parameters, self._as_rows(flat))
 
-                self._workers.run(work, N_CHUNKS if n else 0, 1 if n > 2048 else N_CHUNKS)
-                for layer, shape in enumerate(self.networks[i].layers if n else []):
-                    inputs = [net, layer, execution.offsets, N_CHUNKS]
-                    wp.launch(
-                        add_chunks_kernel, dim=shape.n_out, inputs=inputs, outputs=[weights, self.gradients],
-                        device=self.device,
-                    )  # fmt: skip
-                weights.zero_()
-            if loss is not None and n:
-                value += float(losses.numpy().sum()) / (n * self.n_output_dims[i])
-        del last
-        if n:
-            for part in self.encoding.parts:
+        with self._buffers.lend("dL_dencoded", self._encoded_size(n) if want_features else 1) as dL_dflat:
+            for order, (i, net) in enumerate(nets.items()):
+                target, y = jobs[i]
+                value += self._executions[i].differentiate(
+                    net, flat, n, loss, target, y, encode_rows if encode and order == 0 else None,
+                    self.optimizer.loss_scale, (2 if order else 1) if want_features else 0, self.gradients, dL_dflat,
+                    self._workers, self._buffers,
+                )  # fmt: skip
+            for part in self.encoding.parts if n else []:
                 if part.n_params:
-                    part.backward_parameters(rows, n, dL_dencoded, self.gradients, self._workers)
-        dL_dx = None
-        if input_gradient:
-            dL_dx = wp.zeros((n, self.n_input_dims), dtype=wp.float32, device=self.device)
+                    part.backward_parameters(rows, n, self._as_rows(dL_dflat), self.gradients, self._workers)
+            if input_gradient:
+                dL_dx = wp.zeros((n, self.n_input_dims), dtype=wp.float32, device=self.device)
+                dL_dencoded = self._as_rows(dL_dflat)
 
-            def work_inputs(first, count, worker):
-                row, end = first * BLOCK, min((first + count) * BLOCK, n)
-                for part in self.encoding.parts:
-                    part.backward_inputs(rows, row, end - row, self.parameters, dL_dencoded, dL_dx)
+                def work(first, count, worker):
+                    row, end = first * BLOCK, min((first + count) * BLOCK, n)
+                    for part in self.encoding.parts:
+                        part.backward_inputs(rows, row, end - row, self.parameters, dL_dencoded, dL_dx)
 
-            self._workers.run(work_inputs, self._n_blocks(n), 16)
-        self._buffers.give("dL_dencoded", dL_dflat)
+                self._workers.run(work, n_blocks(n), 16)
         return value, dL_dx
 
     # State ----------------------------------------------------------------------------------------------------------
 
     @property
     def statistics(self) -> dict:
-        """Counters since the beginning: steps taken, batches skipped, inputs that were not finite; and the last norm."""
+        """Since the beginning: steps taken, batches skipped, rows of inputs that were not finite; and the last norm."""
         state = self.optimizer.state.numpy()
         return {
             "steps": int(state[optimizers.STEP]),
@@ -433,109 +419,36 @@ class Model:
 
     def _encode(self, rows, row, end, worker, parameters, encoded, latents=None, n_parts=None):
         inputs = [rows, row, self.n_input_dims]
-        wp.launch(count_nonfinite_rows, dim=end - row, inputs=inputs, outputs=[self._nonfinite, worker], device=self.device)
+        wp.launch(
+            count_nonfinite_rows, dim=end - row, inputs=inputs, outputs=[self._nonfinite, worker], device=self.device
+        )
         for i, part in enumerate(self.encoding.parts[:n_parts]):
             if latents and i in latents:
                 source, index = latents[i]
                 inputs = [source, index, row, part.n_features]
-                wp.launch(gather_columns, dim=end - row, inputs=inputs, outputs=[encoded, part.column], device=self.device)
+                wp.launch(
+                    gather_columns, dim=end - row, inputs=inputs, outputs=[encoded, part.column], device=self.device
+                )
             else:
                 part.forward(rows, row, end - row, part.first_dim, parameters, encoded, part.column)
 
-    @staticmethod
-    def _n_blocks(n):
-        return -(-n // BLOCK)
+    def _encoded_size(self, n):
+        """Floats of the features of `n` rows, in whole blocks."""
+        return max(n_blocks(n), 1) * BLOCK * self.encoding.stride
 
-    def _take_encoded(self, n, kind="encoded"):
-        """Features of `n` rows, padded to whole blocks: as rows, and flat. Padding columns are zero."""
-        size = self._n_blocks(n) * BLOCK * self.encoding.stride
-        flat = self._buffers.take(kind, size)
-        rows = flat.size // self.encoding.stride
-        return flat[: rows * self.encoding.stride].reshape((rows, self.encoding.stride)) if rows else wp.empty(
-            (0, self.encoding.stride), dtype=wp.float32, device=self.device
-        ), flat  # fmt: skip
+    def _as_rows(self, flat):
+        """Features as rows; the columns that pad them are zero."""
+        return flat[: flat.size // self.encoding.stride * self.encoding.stride].reshape((-1, self.encoding.stride))
 
     def _lend_encoded(self, n):
-        model = self
-
-        class Lent:
-            def __enter__(self):
-                self.pair = model._take_encoded(n)
-                return self.pair
-
-            def __exit__(self, *_):
-                model._buffers.give("encoded", self.pair[1])
-
-        return Lent()
-
-    def _lend_scratch(self, network):
-        return self._buffers.lend(
-            ("scratch", network), self._executions[network].scratch_size * self._workers.threads
-        )
+        return self._buffers.lend("encoded", self._encoded_size(n))
 
     def _release(self):
         if self._kept is not None:
-            self._buffers.give("encoded", self._kept[2])
+            self._buffers.give("encoded", self._kept[1])
             self._kept = None
 
     def _part_index(self, part):
         if not isinstance(part, (int, np.integer)) or not 0 <= part < len(self.encoding.parts):
             raise NnError(f"part: found {part!r}; allowed: 0 to {len(self.encoding.parts) - 1}")
         return int(part)
-
-    def _latent(self, part, latent, index, n):
-        piece = self.encoding.parts[part]
-        latent = self._input(latent, piece.n_features, f"latents[{part}]")
-        index = index if isinstance(index, wp.array) else wp.array(np.ascontiguousarray(index, np.int32), device=self.device)
-        if index.shape != (n,) or index.dtype != wp.int32:
-            raise NnError(f"latents[{part}]: found an index of shape {index.shape}; allowed: {n} whole numbers")
-        low, high = (index.numpy().min(), index.numpy().max()) if n else (0, -1)
-        if n and (low < 0 or high >= latent.shape[0]):
-            raise NnError(f"latents[{part}]: found indices from {low} to {high}; allowed: 0 to {latent.shape[0] - 1}")
-        return latent, index
-
-    def _input(self, array, width, name):
-        """A contiguous float32 Warp array of `width` columns; shares memory where it can."""
-        shape = tuple(getattr(array, "shape", ()))
-        if len(shape) != 2 or shape[1] != width:
-            raise NnError(f"{name}: found shape {shape}; allowed: [n, {width}]")
-        if isinstance(array, wp.array):
-            if array.dtype != wp.float32 or array.device != self.device:
-                raise NnError(f"{name}: found {array.dtype.__name__} on {array.device}; allowed: float32 on {self.device}")
-            return array if array.is_contiguous else wp.clone(array)
-        if not isinstance(array, np.ndarray):
-            raise NnError(f"{name}: found {type(array).__name__}; allowed: a NumPy or Warp array")
-        if array.dtype.kind not in "fiu":
-            raise NnError(f"{name}: found {array.dtype}; allowed: float32")
-        array = np.ascontiguousarray(array, np.float32)
-        if array.shape[0] == 0:
-            return wp.empty((0, width), dtype=wp.float32, device=self.device)
-        return wp.array(array, dtype=wp.float32, device=self.device, copy=False)
-
-    def _output(self, out, n, width, like):
-        """An array to write to, and what the caller gets for it."""
-        if out is None:
-            if isinstance(like, wp.array):
-                array = wp.empty((n, width), dtype=wp.float32, device=self.device)
-                return array, array
-            out = np.empty((n, width), np.float32)
-        if tuple(out.shape) != (n, width):
-            raise NnError(f"out: found shape {tuple(out.shape)}; allowed: {(n, width)}")
-        if isinstance(out, wp.array):
-            if out.dtype != wp.float32 or not out.is_contiguous or out.device != self.device:
-                raise NnError(f"out: allowed: a contiguous float32 array on {self.device}")
-            return out, out
-        if out.dtype != np.float32 or not out.flags.c_contiguous or not out.flags.writeable:
-            raise NnError("out: allowed: a contiguous float32 array that can be written")
-        if n == 0:
-            return wp.empty((0, width), dtype=wp.float32, device=self.device), out
-        return wp.array(out, dtype=wp.float32, device=self.device, copy=False), out
-
-    @staticmethod
-    def _like(array, example):
-        return array if isinstance(example, wp.array) else array.numpy()
-
-    @staticmethod
-    def _check_rows(array, rows):
-        if array.shape[0] != rows.shape[0]:
-            raise NnError(f"found {array.shape[0]} rows of targets for {rows.shape[0]} rows of inputs")

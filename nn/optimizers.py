@@ -17,7 +17,9 @@ import warp as wp
 from nn import config as c
 
 # Entries of the state.
-STEP, SKIPPED, LOSS_SCALE, GOOD_STEPS, LEARNING_RATE, GRADIENT_FACTOR, SKIP, EMA_OLD, EMA_NEW, NORM, LOW, HIGH = range(12)
+STEP, SKIPPED, LOSS_SCALE, GOOD_STEPS, LEARNING_RATE, GRADIENT_FACTOR, SKIP, EMA_OLD, EMA_NEW, NORM, LOW, HIGH = range(
+    12
+)
 STATE_SIZE = 12
 N_RANGES = 64  # of gradients whose squares are summed apart; fixed, so that sums do not depend on threads
 GROWTH_INTERVAL = 2000.0
@@ -119,8 +121,8 @@ def decide(sums: wp.array[wp.float64], h: Hyperparameters, state: wp.array[wp.fl
     state[GOOD_STEPS] = good
 
 
-# One definition for both devices: a thread of CUDA takes one parameter, one of the CPU device thousands, in loops without
-# branches that the compiler turns into vector instructions.
+# One definition for both devices: a thread of CUDA takes one parameter, one of the CPU device thousands, in loops
+# without branches that the compiler turns into vector instructions.
 _STEP = """
     float* __restrict__ P = parameters.data;
     float* __restrict__ G = gradients.data;
@@ -140,7 +142,8 @@ _STEP = """
     const float low = h.adabound ? static_cast<float>(state.data[{LOW}]) : 0.0f;
     const float high = h.adabound ? static_cast<float>(state.data[{HIGH}]) : 3.4e38f;
     const float limit = h.clipping_magnitude > 0.0f ? h.clipping_magnitude : 3.4e38f;
-    const float beta1 = h.beta1, beta2 = h.beta2, epsilon = h.epsilon, l2 = h.l2_reg, other_factor = h.non_matrix_factor;
+    const float beta1 = h.beta1, beta2 = h.beta2, epsilon = h.epsilon, l2 = h.l2_reg;
+    const float other_factor = h.non_matrix_factor;
     const float relative = h.relative_decay, absolute = h.absolute_decay;
     const int n_matrix = h.n_matrix, last = h.n_corrections - 1;
     const int move_matrix = h.optimize_matrix, move_other = h.optimize_non_matrix;
@@ -273,7 +276,10 @@ class Optimizer:
             h.relative_decay, h.absolute_decay = cfg.relative_decay, cfg.absolute_decay
             h.adabound, h.clipping_magnitude = int(cfg.adabound), cfg.clipping_magnitude
             h.non_matrix_factor = cfg.non_matrix_learning_rate_factor
-            h.optimize_matrix, h.optimize_non_matrix = int(cfg.optimize_matrix_params), int(cfg.optimize_non_matrix_params)
+            h.optimize_matrix, h.optimize_non_matrix = (
+                int(cfg.optimize_matrix_params),
+                int(cfg.optimize_non_matrix_params),
+            )
         corrections = bias_corrections(cfg.beta1, cfg.beta2) if self.adam else np.ones(1, np.float32)
         h.n_corrections, h.max_norm, h.dynamic_scale = len(corrections), max_norm, int(loss_scale == "dynamic")
         self.hyperparameters, self.device, self.n_params = h, device, n_params

@@ -1,7 +1,8 @@
 """Models inside PyTorch: an autograd function and a module. Needs PyTorch, which nothing else here does.
 
-The parameters of the module are a tensor that shares the memory of the model's, so either side may train them. Gradients
-flow to the inputs and to the parameters; tensors are shared, not copied, where they are contiguous and of float32.
+The parameters of the module are a tensor that shares the memory of the model's, so either side may train them.
+Gradients flow to the inputs and to the parameters; tensors are shared, not copied, where they are
+contiguous and of float32.
 """
 
 from __future__ import annotations

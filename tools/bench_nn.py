@@ -2,10 +2,10 @@
 
     python -m tools.bench_nn [--sizes 14 16] [--threads N] [--rounds 5] [--json FILE]
 
-Three tasks: ``npm``, the network of Neural Parametric Mixtures (dense grid, spherical harmonics and one-blob into 3 × 64,
-32 outputs); ``mlp``, its network alone; ``image``, the hash grid and network of `tools.fit_image`. Training is a whole
-step: forward, mean square error, backward, Adam over all parameters, and the moving average. Rounds of both engines take
-turns; the median counts. First calls, which compile, are not timed.
+Three tasks: ``npm``, the network of Neural Parametric Mixtures (dense grid, spherical harmonics and one-blob into
+3 × 64, 32 outputs); ``mlp``, its network alone; ``image``, the hash grid and network of `tools.fit_image`. Training is
+a whole step: forward, mean square error, backward, Adam over all parameters, and the moving average. Rounds of both
+engines take turns; the median counts. First calls, which compile, are not timed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,13 @@ from nn.workers import available_cores
 from tools.bench_common import machine, megabytes, peak_memory_bytes, spread
 
 _ADAM = {"otype": "Adam", "learning_rate": 1e-2, "beta1": 0.9, "beta2": 0.99, "epsilon": 1e-15, "l2_reg": 0.0}
-_MLP = {"otype": "FullyFusedMLP", "activation": "ReLU", "output_activation": "None", "n_neurons": 64, "n_hidden_layers": 3}
+_MLP = {
+    "otype": "FullyFusedMLP",
+    "activation": "ReLU",
+    "output_activation": "None",
+    "n_neurons": 64,
+    "n_hidden_layers": 3,
+}
 _AVERAGED = {"otype": "EMA", "decay": 0.95, "nested": _ADAM}
 TASKS = {
     "npm": (
@@ -99,7 +105,9 @@ class Bench:
         values[self.model.n_matrix_params :] *= 1e4  # features of a trained size, for the accuracy
         rng = np.random.default_rng(0)
         self.x, self.target = rng.random((n, n_in), np.float32), rng.random((n, n_out), np.float32)
-        self.calls = {"ours": (lambda: self.model.train_step(self.x, self.target), lambda: self.model.inference(self.x))}
+        self.calls = {
+            "ours": (lambda: self.model.train_step(self.x, self.target), lambda: self.model.inference(self.x))
+        }
         x, target = torch.from_numpy(self.x), torch.from_numpy(self.target)
         some = slice(0, 4096)
         exact = Network(cfg, n_in, n_out).double()
@@ -146,7 +154,9 @@ class Bench:
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tools.bench_nn", description=__doc__.partition("\n")[0])
     parser.add_argument("--tasks", nargs="+", choices=list(TASKS), default=list(TASKS))
-    parser.add_argument("--sizes", nargs="+", type=int, default=[14, 16, 18], metavar="N", help="batches of 2^N samples")
+    parser.add_argument(
+        "--sizes", nargs="+", type=int, default=[14, 16, 18], metavar="N", help="batches of 2^N samples"
+    )
     parser.add_argument("--threads", type=int, default=available_cores(), help="of both engines")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--compile", action="store_true", help="also torch.compile, which needs a C++ compiler")
@@ -158,9 +168,8 @@ def main(arguments: list[str] | None = None) -> int:
     task, largest = options.tasks[0], max(options.sizes)
     description, n_in, n_out = TASKS[task]
     model = nn.Model.from_config(description, n_in, n_out, threads=options.threads)
-    before = peak_memory_bytes()
     model.train_step(np.zeros((1 << largest, n_in), np.float32), np.zeros((1 << largest, n_out), np.float32))
-    memory = peak_memory_bytes() - before
+    memory = peak_memory_bytes()
     del model
     try:
         import torch
@@ -194,7 +203,8 @@ def main(arguments: list[str] | None = None) -> int:
                     )  # fmt: skip
     console.print(table)
     console.print(
-        f"load {report['machine']['load']}; training {options.tasks[0]} with 2^{largest} samples adds {megabytes(memory)} of memory"
+        f"load {report['machine']['load']}; peak memory of the process after a training step of {options.tasks[0]} "
+        f"with 2^{largest} samples, before PyTorch is loaded: {megabytes(memory)}"
     )
     if options.json:
         with open(options.json, "w", encoding="utf-8") as stream:

@@ -136,7 +136,11 @@ class Trainer:
         if isinstance(optimizer, c.EMA):
             optimizer, self.decay = optimizer.nested, optimizer.decay
         self.optimizer = torch.optim.Adam(
-            network.parameters(), optimizer.learning_rate, (optimizer.beta1, optimizer.beta2), optimizer.epsilon, fused=True
+            network.parameters(),
+            optimizer.learning_rate,
+            (optimizer.beta1, optimizer.beta2),
+            optimizer.epsilon,
+            fused=True,
         )
         self.averages = [p.detach().clone() for p in network.parameters()]
         self.call = torch.compile(network) if compiled else network

@@ -28,7 +28,8 @@ CONFIG = {
     "network": {"otype": "FullyFusedMLP", "activation": "ReLU", "output_activation": "None", "n_neurons": 64,
                 "n_hidden_layers": 2},
     "loss": {"otype": "RelativeL2"},
-    "optimizer": {"otype": "Adam", "learning_rate": 1e-2, "beta1": 0.9, "beta2": 0.99, "epsilon": 1e-15, "l2_reg": 1e-6},
+    "optimizer": {"otype": "Adam", "learning_rate": 1e-2, "beta1": 0.9, "beta2": 0.99, "epsilon": 1e-15,
+                  "l2_reg": 1e-6},
 }  # fmt: skip
 
 
@@ -123,7 +124,12 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     pictures = {2**k for k in range(options.steps.bit_length())} | {options.steps}
-    columns = [TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeRemainingColumn()]
+    columns = [
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed}/{task.total}"),
+        TimeRemainingColumn(),
+    ]
     seconds = 0.0
     with Progress(*columns, console=console) as progress:
         task = progress.add_task("training", total=options.steps)
@@ -134,7 +140,9 @@ def main(arguments: list[str] | None = None) -> int:
             if step in pictures:
                 picture = fit.picture()
                 save(folder / f"{step:06d}.png", picture)
-                console.print(f"step {step:6d}  loss {loss:.3e}  PSNR {psnr(picture, fit.image):.2f} dB  {seconds:.2f} s")
+                console.print(
+                    f"step {step:6d}  loss {loss:.3e}  PSNR {psnr(picture, fit.image):.2f} dB  {seconds:.2f} s"
+                )
             progress.update(task, advance=1, description=f"loss {loss:.2e}")
     return 0
 

@@ -27,10 +27,12 @@ def spherical_harmonics_factors() -> np.ndarray:
         double_factorial = math.prod(range(2 * m - 1, 0, -2))
         q = (-1) ** m * math.sqrt((2 * m + 1) / (4 * math.pi) / math.factorial(2 * m)) * double_factorial
         factors[8 * m + m, 0] = q * (math.sqrt(2) if m else 1)
-        for l in range(m + 1, 8):
-            factors[8 * l + m, 0] = math.sqrt((4 * l * l - 1) / (l * l - m * m))
-            factors[8 * l + m, 1] = math.sqrt(
-                (2 * l + 1) * ((l - 1) ** 2 - m * m) / ((2 * l - 3) * (l * l - m * m)) if l > m + 1 else 0
+        for band in range(m + 1, 8):
+            factors[8 * band + m, 0] = math.sqrt((4 * band * band - 1) / (band * band - m * m))
+            factors[8 * band + m, 1] = math.sqrt(
+                (2 * band + 1) * ((band - 1) ** 2 - m * m) / ((2 * band - 3) * (band * band - m * m))
+                if band > m + 1
+                else 0
             )
     return factors
 
@@ -122,9 +124,7 @@ class _GridPart(_Part):
             )
             return
         inputs = [x, self.first_dim, self.levels, dL_dencoded, self.column]
-        wp.launch(
-            self._kernels[1], dim=(self.cfg.n_levels, n_rows), inputs=inputs, outputs=[view], device=x.device
-        )
+        wp.launch(self._kernels[1], dim=(self.cfg.n_levels, n_rows), inputs=inputs, outputs=[view], device=x.device)
 
     def backward_inputs(self, x, first_row, n_rows, parameters, dL_dencoded, dL_dx):
         """Adds the gradient with respect to the inputs of these rows."""

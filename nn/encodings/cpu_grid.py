@@ -79,7 +79,8 @@ _BACKWARD = """
     u32 run_cell[D], run_idx[C];
     bool running = false;
     auto flush = [&]() {
-        for (int c = 0; c < C; ++c) *(feature*)(table + size_t(run_idx[c]) * F) += __builtin_convertvector(run[c], feature);
+        for (int c = 0; c < C; ++c)
+            *(feature*)(table + size_t(run_idx[c]) * F) += __builtin_convertvector(run[c], feature);
         running = false;
     };
     for (int first = 0; first < n_rows; first += B) {

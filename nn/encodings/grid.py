@@ -64,7 +64,8 @@ class GridLayout:
             offset += size
             if offset * cfg.n_features_per_level >= _MOST_ENTRIES:
                 raise ConfigError(
-                    path, f"found {offset * cfg.n_features_per_level:.2g} parameters up to level {level}; allowed: < 2^31"
+                    path,
+                    f"found {offset * cfg.n_features_per_level:.2g} parameters up to level {level}; allowed: < 2^31",
                 )
         self.n_entries = offset
 

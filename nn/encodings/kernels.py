@@ -265,12 +265,12 @@ def spherical_harmonics_forward(
     for m in range(degree):
         before = wp.float32(0.0)
         q = factors[m * 8 + m, 0]
-        for l in range(m, degree):
-            if l > m:
-                q_next = factors[l * 8 + m, 0] * vz * q - factors[l * 8 + m, 1] * before
+        for band in range(m, degree):
+            if band > m:
+                q_next = factors[band * 8 + m, 0] * vz * q - factors[band * 8 + m, 1] * before
                 before = q
                 q = q_next
-            c = column + l * l + l
+            c = column + band * band + band
             if m == 0:
                 encoded[row, c] = q
             else:
@@ -307,17 +307,17 @@ def spherical_harmonics_backward(
         d_before = wp.float32(0.0)
         q = factors[m * 8 + m, 0]
         dq = wp.float32(0.0)
-        for l in range(m, degree):
-            if l > m:
-                a = factors[l * 8 + m, 0]
-                b = factors[l * 8 + m, 1]
+        for band in range(m, degree):
+            if band > m:
+                a = factors[band * 8 + m, 0]
+                b = factors[band * 8 + m, 1]
                 q_next = a * vz * q - b * before
                 dq_next = a * (q + vz * dq) - b * d_before
                 before = q
                 d_before = dq
                 q = q_next
                 dq = dq_next
-            c = column + l * l + l
+            c = column + band * band + band
             if m == 0:
                 total[2] += dq * dL_dencoded[row, c]
             else:
@@ -353,6 +353,8 @@ def gather_columns(
 
 
 @wp.kernel
-def count_nonfinite_rows(x: wp.array2d[wp.float32], first_row: int, n_dims: int, counter: wp.array[wp.int32], slot: int):
+def count_nonfinite_rows(
+    x: wp.array2d[wp.float32], first_row: int, n_dims: int, counter: wp.array[wp.int32], slot: int
+):
     if has_nonfinite(x, first_row + wp.tid(), n_dims) != 0:
         wp.atomic_add(counter, slot, 1)

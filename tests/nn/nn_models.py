@@ -13,7 +13,8 @@ NPM = {
     "optimizer": {
         "otype": "Ema",
         "decay": 0.95,
-        "nested": {"otype": "Adam", "learning_rate": 1e-2, "beta1": 0.9, "beta2": 0.99, "epsilon": 1e-15, "l2_reg": 1e-6},
+        "nested": {"otype": "Adam", "learning_rate": 1e-2, "beta1": 0.9, "beta2": 0.99, "epsilon": 1e-15,
+                   "l2_reg": 1e-6},
     },
     "encoding": {
         "otype": "Composite",
@@ -31,7 +32,11 @@ NPM = {
 
 def make(encoding=None, network=None, n_in=3, n_out=4, seed=1, threads=1, spread=0.5, **rest):
     """A model whose parameters are all random and of a size that matters."""
-    network = {"otype": "MLP", "n_neurons": 16, "n_hidden_layers": 1, **(network or {})} if not isinstance(network, list) else network
+    network = (
+        {"otype": "MLP", "n_neurons": 16, "n_hidden_layers": 1, **(network or {})}
+        if not isinstance(network, list)
+        else network
+    )
     config = {"encoding": encoding or {"otype": "Identity"}, "network": network, **rest}
     model = nn.Model.from_config(config, n_in, n_out, seed=seed, threads=threads)
     rng = np.random.default_rng(seed + 100)

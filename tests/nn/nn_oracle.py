@@ -6,6 +6,7 @@ carried through all layers. The float32 kernels are held to 1e-6 of it.
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -74,10 +75,14 @@ def encode_grid(cfg, x, table):
 def encode_spherical_harmonics(cfg, x):
     v = 2 * x - 1
     values, sizes = [], []
-    for l in range(cfg.degree):
-        for m in range(-l, l + 1):
-            k = math.sqrt((2 * l + 1) / (4 * math.pi) * math.factorial(l - abs(m)) / math.factorial(l + abs(m)))
-            legendre = np.polynomial.legendre.Legendre.basis(l).deriv(abs(m)) if m else np.polynomial.Legendre.basis(l)
+    for band in range(cfg.degree):
+        for m in range(-band, band + 1):
+            k = math.sqrt(
+                (2 * band + 1) / (4 * math.pi) * math.factorial(band - abs(m)) / math.factorial(band + abs(m))
+            )
+            legendre = (
+                np.polynomial.legendre.Legendre.basis(band).deriv(abs(m)) if m else np.polynomial.Legendre.basis(band)
+            )
             powers = legendre.convert(kind=np.polynomial.Polynomial).coef
             z = np.polynomial.polynomial.polyval(v[:, 2], powers)
             z_size = np.polynomial.polynomial.polyval(np.abs(v[:, 2]), np.abs(powers))
@@ -210,7 +215,7 @@ class Oracle:
             parts = list(zip(self.parts, self.part_dims(), strict=True))[: cfg.n_parts]
             widths = [sum(self.n_features(p, d) for p, d in parts)] + [cfg.n_neurons] * cfg.n_hidden_layers + [n_out]
             layers = []
-            for a, b in zip(widths[:-1], widths[1:], strict=True):
+            for a, b in itertools.pairwise(widths):
                 weight = parameters[at : at + a * b].reshape(b, a)
                 at += a * b
                 bias = parameters[at : at + b] if cfg.bias else np.zeros(b)

@@ -75,7 +75,11 @@ def changed(path, value):
 
 
 WRONG = [
-    (["encodin"], {}, r"^encodin: unknown key \(did you mean 'encoding'\?\); allowed: encoding, gradient_clipping, loss"),
+    (
+        ["encodin"],
+        {},
+        r"^encodin: unknown key \(did you mean 'encoding'\?\); allowed: encoding, gradient_clipping, loss",
+    ),
     (["loss", "otype"], "L3", r'^loss\.otype: found "L3"; allowed: L1, L2, RelativeL1'),
     (["loss"], {}, r"^loss\.otype: found null; allowed: L1"),
     (["network", "n_neurons"], 0, r"^network\.n_neurons: found 0; allowed: a whole number >= 1 and <= 512"),
@@ -85,7 +89,11 @@ WRONG = [
     (["encoding", "nested", 1, "degree"], 9, r"^encoding\.nested\[1\]\.degree: found 9; allowed: .* <= 8"),
     (["encoding", "nested", 2, "bins"], 4, r"^encoding\.nested\[2\]\.bins: unknown key .*allowed: otype, n_bins"),
     (["encoding", "nested", 0, "n_features_per_level"], 3, r"n_features_per_level: found 3; allowed: 1, 2, 4, 8"),
-    (["encoding", "nested", 0, "type"], "Hash", r"^encoding\.nested\[0\]\.type: found \"Hash\"; DenseGrid allows: Dense"),
+    (
+        ["encoding", "nested", 0, "type"],
+        "Hash",
+        r"^encoding\.nested\[0\]\.type: found \"Hash\"; DenseGrid allows: Dense",
+    ),
     (["encoding", "nested"], [], r"^encoding\.nested: found \[\]; allowed: a list that is not empty"),
     (["optimizer", "nested", "beta1"], 1.0, r"^optimizer\.nested\.beta1: found 1\.0; allowed: a number >= 0 and < 1"),
     (["optimizer", "nested", "otype"], "Shampoo", r"found \"Shampoo\"; allowed: Adam, SGD, EMA, ExponentialDecay"),

@@ -166,9 +166,7 @@ def test_networks_that_share_an_encoding():
     expected = numerical(total, values, model.gradients.numpy())
     check(model.gradients.numpy(), expected, np.abs(expected).max())
     for i in range(2):
-        np.testing.assert_allclose(
-            model.inference(x, network=i), oracle.forward(x, values, i)[0], rtol=1e-5, atol=1e-6
-        )
+        np.testing.assert_allclose(model.inference(x, network=i), oracle.forward(x, values, i)[0], rtol=1e-5, atol=1e-6)
 
 
 def test_given_gradient_equals_loss_gradient():
@@ -202,7 +200,12 @@ def test_both_executions_of_the_grid_agree(kind):
     import warp as wp
 
     dims, features, interpolation, hashed = kind
-    part = {**GRID, "n_features_per_level": features, "interpolation": interpolation, "type": "Hash" if hashed else "Tiled"}
+    part = {
+        **GRID,
+        "n_features_per_level": features,
+        "interpolation": interpolation,
+        "type": "Hash" if hashed else "Tiled",
+    }
     model = make(part, n_in=dims, n_out=2)
     piece = model.encoding.parts[0]
     n = 100

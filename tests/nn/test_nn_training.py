@@ -284,7 +284,7 @@ def test_huge_learning_rate_stays_finite_with_clipping(optimizer):
 
 
 def test_extreme_inputs():
-    """Corners, vertices, far outside, and -0.0 give finite values; NaN and infinity are counted and stay in their rows."""
+    """Corners, vertices, far outside, and -0.0 stay finite; NaN and infinity are counted and keep to their rows."""
     encoding = {
         "otype": "Composite",
         "nested": [
@@ -353,7 +353,10 @@ def test_wrong_arrays_are_named():
         (lambda: model.inference(x[:, :2]), r"x: found shape \(10, 2\); allowed: \[n, 3\]"),
         (lambda: model.inference([[0, 0, 0]]), "x: found shape"),
         (lambda: model.inference(x.astype(complex)), "complex128; allowed: float32"),
-        (lambda: model.inference(x, out=np.empty((9, 4), np.float32)), r"out: found shape \(9, 4\); allowed: \(10, 4\)"),
+        (
+            lambda: model.inference(x, out=np.empty((9, 4), np.float32)),
+            r"out: found shape \(9, 4\); allowed: \(10, 4\)",
+        ),
         (lambda: model.train_step(x, inputs(9, 4)), "9 rows of targets for 10 rows of inputs"),
         (lambda: model.train_step(x), "found both or neither"),
         (lambda: model.backward(inputs(10, 4)), "no forward"),
