@@ -26,9 +26,8 @@ SINE = wp.constant(9)
 
 @wp.func
 def sigmoid(x: wp.float32):
-    """The logistic function, with full relative precision on both sides."""
-    e = wp.exp(-wp.abs(x))
-    return wp.where(x < 0.0, e, 1.0) / (1.0 + e)
+    """The logistic function."""
+    return 1.0 / (1.0 + wp.exp(-x))
 
 
 @wp.func

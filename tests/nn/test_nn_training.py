@@ -133,6 +133,18 @@ def test_batch_with_bad_gradient_is_skipped(bad):
     assert model.statistics["steps"] == 2
 
 
+@pytest.mark.parametrize("loss", ["L1", "MAPE", "SMAPE", "RelativeL1"])
+def test_losses_of_a_sign_keep_nan(loss):
+    model = make(n_out=2, loss={"otype": loss})
+    x = inputs(20, 3)
+    target = model.inference(x)
+    assert model.compute_gradients(x, target) == 0
+    assert (model.gradients.numpy() == 0).all()  # at the minimum the slope is zero
+    target[3, 1] = np.nan
+    assert np.isnan(model.train_step(x, target))
+    assert model.statistics["skipped_batches"] == 1
+
+
 def test_loss_scaling():
     """A factor of all gradients changes nothing but them; a dynamic one halves with every bad batch."""
     x, target = inputs(100, 3), inputs(100, 4)
@@ -312,6 +324,20 @@ def test_extreme_inputs():
             assert np.isfinite(np.delete(result, 5, 0)).all()
     model.train_step(y, inputs(len(y), 4))
     assert model.statistics["skipped_batches"] == 1
+
+
+def test_rows_of_an_earlier_batch_leave_no_trace():
+    """Blocks are padded: what a larger batch of NaN left there must not reach the gradients of a smaller one."""
+    model = make(GRID, network={"n_hidden_layers": 2}, optimizer=ADAM)
+    x, target = inputs(93, 3), inputs(93, 4)
+    model.compute_gradients(x, target)
+    expected = model.gradients.numpy().copy()
+    model.zero_gradients()
+    model.compute_gradients(np.full((200, 3), np.nan, np.float32), inputs(200, 4))
+    model.optimizer_step()
+    assert model.statistics["skipped_batches"] == 1
+    model.compute_gradients(x, target)
+    np.testing.assert_array_equal(model.gradients.numpy(), expected)
 
 
 def test_own_loss():
