@@ -302,9 +302,8 @@ def make_train_kernel(loss):
     Args:
         loss: A wp.func of `nn.losses.make_loss`; None: `target` is dL/dy already.
     """
-    name = "given" if loss is None else loss.key.rsplit(".", 1)[-1]
 
-    @wp.kernel(enable_backward=False, module=f"nn.cpu_train_{name}")
+    @wp.kernel(enable_backward=False, module="unique")
     def train(
         encoded: wp.array[wp.float32],
         n_rows: int,

@@ -106,5 +106,4 @@ def make_loss(otype: str):
             dL_dy[dL_dy_offset + i] = value[1] * factor
         return total
 
-    loss.key = f"loss_{otype}"
     return loss

@@ -30,7 +30,8 @@ _ALIGNMENT = 8  # of a grid's first parameter, in floats
 
 
 class Model:
-    """See `Model.from_config`.
+    """See `Model.from_config`. Several threads may call `inference` and `encode` at once; training is for one thread,
+    which spreads a batch over threads itself.
 
     Attributes:
         config: The configuration, complete with defaults.

@@ -340,11 +340,11 @@ def test_rows_of_an_earlier_batch_leave_no_trace():
     np.testing.assert_array_equal(model.gradients.numpy(), expected)
 
 
-def test_own_loss():
-    """A loss of the caller's own runs inside the training kernel."""
+def power_loss(scale):
+    """A loss of one's own; all have one name."""
 
     @wp.func
-    def cubic(
+    def loss(
         y: wp.array[wp.float32],
         y_offset: int,
         target: wp.array2d[wp.float32],
@@ -356,20 +356,28 @@ def test_own_loss():
         total = wp.float32(0.0)
         for i in range(target.shape[1]):
             d = y[y_offset + i] - target[row, i]
-            total += wp.abs(d) * d * d
-            dL_dy[dL_dy_offset + i] = 3.0 * wp.abs(d) * d * factor
+            total += scale * wp.abs(d) * d * d
+            dL_dy[dL_dy_offset + i] = scale * 3.0 * wp.abs(d) * d * factor
         return total
 
+    return loss
+
+
+def test_own_loss():
+    """Losses of the caller's own run inside the training kernel."""
     model = make(GRID)
     x, target = inputs(200, 3), inputs(200, 4)
     y = model.inference(x)
-    loss = model.compute_gradients(x, target, loss=cubic)
-    found = model.gradients.numpy().copy()
-    assert loss == pytest.approx((np.abs(y - target) ** 3).mean(), rel=1e-5)
-    model.zero_gradients()
-    model.forward(x)
-    model.backward((3 * np.abs(y - target) * (y - target) / y.size).astype(np.float32))
-    np.testing.assert_allclose(found, model.gradients.numpy(), atol=1e-6 * np.abs(found).max())
+    losses = {scale: power_loss(scale) for scale in (1.0, 2.0)}
+    for scale in (1.0, 2.0, 1.0):
+        model.zero_gradients()
+        value = model.compute_gradients(x, target, loss=losses[scale])
+        found = model.gradients.numpy().copy()
+        assert value == pytest.approx(scale * (np.abs(y - target) ** 3).mean(), rel=1e-5)
+        model.zero_gradients()
+        model.forward(x)
+        model.backward((scale * 3 * np.abs(y - target) * (y - target) / y.size).astype(np.float32))
+        np.testing.assert_allclose(found, model.gradients.numpy(), atol=1e-6 * np.abs(found).max())
 
 
 def test_wrong_arrays_are_named():
