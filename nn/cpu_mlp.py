@@ -141,9 +141,11 @@ class Network:
 
 
 @wp.kernel
-def pack(parameters: wp.array[wp.float32], offsets: wp.array2d[wp.int32], layer: int, net: Network):
-    """Copies the parameters of a layer to where the products read them; one thread per output."""
-    o = wp.tid()
+def pack(parameters: wp.array[wp.float32], offsets: wp.array2d[wp.int32], net: Network):
+    """Copies the parameters to where the products read them; threads: layers × outputs of the widest."""
+    layer, o = wp.tid()
+    if o >= net.table[layer, N_OUT]:
+        return
     n_in = net.table[layer, N_IN]
     weight = offsets[layer, 0] + o * n_in
     for i in range(n_in):
@@ -375,15 +377,16 @@ def make_train_kernel(loss):
 @wp.kernel
 def add_chunks(
     net: Network,
-    layer: int,
     offsets: wp.array2d[wp.int32],
     n_chunks: int,
     # in and out
     dL_dweights: wp.array[wp.float32],
     gradients: wp.array[wp.float32],
 ):
-    """Adds the chunks of a layer in order, to the parameters' gradients, and clears them; one thread per output."""
-    o = wp.tid()
+    """Adds the chunks, in order, to the gradients of all parameters; threads: layers × outputs of the widest."""
+    layer, o = wp.tid()
+    if o >= net.table[layer, N_OUT]:
+        return
     n_in = net.table[layer, N_IN]
     in_pad = net.table[layer, IN_PAD]
     to = offsets[layer, 0] + o * n_in

@@ -66,6 +66,7 @@ class CpuNetwork:
             widest = max(widest, in_pad, out_pad)
             table.append([row[key] for key in range(13)])
             offsets.append([offset + layer.weight, offset + layer.bias])
+        self.outputs = (len(mlp.layers), max(layer.n_out for layer in mlp.layers))
         self.table = wp.array(np.array(table, np.int32), dtype=wp.int32, device=device)
         self.offsets = wp.array(np.array(offsets, np.int32), dtype=wp.int32, device=device)
         self.packed_size, self.gradient_size = packed, gradient
@@ -79,8 +80,7 @@ class CpuNetwork:
         net.packed = wp.zeros(self.packed_size, dtype=wp.float32, device=self.device)
         net.scratch_size, net.gradient_size = self.scratch_size, self.gradient_size
         net.gradient, net.gradient_stride = self.gradient, self.gradient_stride
-        for i, layer in enumerate(self.mlp.layers):
-            wp.launch(pack, dim=layer.n_out, inputs=[parameters, self.offsets, i, net], device=self.device)
+        wp.launch(pack, dim=self.outputs, inputs=[parameters, self.offsets, net], device=self.device)
         return net
 
     def lend_scratch(self, workers: Workers, buffers: Buffers):
@@ -132,8 +132,7 @@ class CpuNetwork:
                 )
 
             workers.run(work, N_CHUNKS, 1 if n > 2048 else N_CHUNKS)
-            for i, layer in enumerate(self.mlp.layers):
-                inputs = [net, i, self.offsets, N_CHUNKS]
-                wp.launch(add_chunks, dim=layer.n_out, inputs=inputs, outputs=[chunks, gradients], device=self.device)
+            inputs = [net, self.offsets, N_CHUNKS]
+            wp.launch(add_chunks, dim=self.outputs, inputs=inputs, outputs=[chunks, gradients], device=self.device)
             chunks.zero_()
         return float(losses.numpy().sum()) / (n * self.mlp.n_out) if loss is not None else 0.0
