@@ -1,0 +1,84 @@
+"""Arrays of the caller as Warp arrays of a device, without copies where that is possible."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from nn.errors import NnError
+
+Array = np.ndarray | wp.array
+
+
+def as_input(array: Array, width: int, name: str, device) -> wp.array:
+    """A contiguous float32 array ``[n, width]`` that shares the memory of `array` if that is such an array.
+
+    Raises:
+        NnError: Kind, shape, type or device are not allowed; `name` is what the message calls it.
+    """
+    shape = tuple(getattr(array, "shape", ()))
+    if len(shape) != 2 or shape[1] != width:
+        raise NnError(f"{name}: found shape {shape}; allowed: [n, {width}]")
+    if isinstance(array, wp.array):
+        if array.dtype != wp.float32 or array.device != device:
+            raise NnError(f"{name}: found {array.dtype.__name__} on {array.device}; allowed: float32 on {device}")
+        return array if array.is_contiguous else wp.clone(array)
+    if not isinstance(array, np.ndarray):
+        raise NnError(f"{name}: found {type(array).__name__}; allowed: a NumPy or Warp array")
+    if array.dtype.kind not in "fiu":
+        raise NnError(f"{name}: found {array.dtype}; allowed: float32")
+    array = np.ascontiguousarray(array, np.float32)
+    if array.shape[0] == 0:
+        return empty((0, width), device)
+    return wp.array(array, dtype=wp.float32, device=device, copy=False)
+
+
+def as_output(out: Array | None, n: int, width: int, like: Array, device) -> tuple[wp.array, Array]:
+    """An array ``[n, width]`` to write to, and what the caller gets for it: `out`, or a new one of `like`'s kind.
+
+    Raises:
+        NnError: `out` cannot be written to in place.
+    """
+    if out is None:
+        if isinstance(like, wp.array):
+            array = empty((n, width), device)
+            return array, array
+        out = np.empty((n, width), np.float32)
+    if tuple(out.shape) != (n, width):
+        raise NnError(f"out: found shape {tuple(out.shape)}; allowed: {(n, width)}")
+    if isinstance(out, wp.array):
+        if out.dtype != wp.float32 or not out.is_contiguous or out.device != device:
+            raise NnError(f"out: allowed: a contiguous float32 array on {device}")
+        return out, out
+    if out.dtype != np.float32 or not out.flags.c_contiguous or not out.flags.writeable:
+        raise NnError("out: allowed: a contiguous float32 array that can be written")
+    if n == 0:
+        return empty((0, width), device), out
+    return wp.array(out, dtype=wp.float32, device=device, copy=False), out
+
+
+def as_index(index: Array, n: int, most: int, name: str, device) -> wp.array:
+    """`n` row numbers below `most`, as int32.
+
+    Raises:
+        NnError: Its length, type or a number is not allowed.
+    """
+    if not isinstance(index, wp.array):
+        index = wp.array(np.ascontiguousarray(index, np.int32), dtype=wp.int32, device=device)
+    if index.shape != (n,) or index.dtype != wp.int32:
+        raise NnError(f"{name}: found an index of shape {index.shape}; allowed: {n} whole numbers")
+    values = index.numpy()
+    if n and (values.min() < 0 or values.max() >= most):
+        raise NnError(f"{name}: found indices from {values.min()} to {values.max()}; allowed: 0 to {most - 1}")
+    return index
+
+
+def empty(shape: tuple[int, ...], device) -> wp.array:
+    """A float32 array that holds anything."""
+    return wp.empty(shape, dtype=wp.float32, device=device)
+
+
+def check_rows(array: wp.array, rows: wp.array) -> None:
+    """Raises an `NnError` unless both have as many rows."""
+    if array.shape[0] != rows.shape[0]:
+        raise NnError(f"found {array.shape[0]} rows of targets for {rows.shape[0]} rows of inputs")

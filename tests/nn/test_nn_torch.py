@@ -1,0 +1,82 @@
+"""Gradients of the composed model against PyTorch's automatic differentiation, and the bindings."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from test_nn_values import inputs  # noqa: E402
+
+import nn  # noqa: E402
+from nn import torch_bindings  # noqa: E402
+from tools.bench_nn import TASKS, Bench  # noqa: E402
+from tools.bench_nn_torch import Network  # noqa: E402
+
+
+@pytest.mark.parametrize("task", list(TASKS))
+def test_values_and_gradients_of_the_benchmark_against_torch(task):
+    """Our model and the peer of the benchmark are one function, with one gradient (in float64 there)."""
+    description, n_in, n_out = TASKS[task]
+    model = nn.Model.from_config(description, n_in, n_out, threads=2)
+    values = model.parameters.numpy()
+    values[model.n_matrix_params :] *= 1e4
+    peer = Network(model.config, n_in, n_out).double()
+    peer.load(values, model.n_matrix_params)
+    x, target = inputs(1000, n_in, low=0, high=1), inputs(1000, n_out)
+    y = peer(torch.from_numpy(x).double())
+    loss = torch.nn.functional.mse_loss(y, torch.from_numpy(target).double())
+    loss.backward()
+    ours = np.empty((1000, n_out), np.float32)
+    assert model.compute_gradients(x, target, outputs=ours) == pytest.approx(loss.item(), rel=1e-6)
+    np.testing.assert_allclose(ours, y.detach().numpy(), atol=2e-6 * float(y.detach().abs().max()))
+    gradients = model.gradients.numpy()
+    for tensors, at in ((peer.mlp.parameters(), 0), (peer.grids.parameters(), -(-model.n_matrix_params // 8) * 8)):
+        for tensor in tensors:
+            found = gradients[at : at + tensor.numel()].reshape(tensor.shape)
+            expected = tensor.grad.numpy()
+            np.testing.assert_allclose(found, expected, atol=2e-5 * np.abs(expected).max())
+            at += tensor.numel()
+
+
+def test_module_trains_with_an_optimiser_of_torch():
+    description, n_in, n_out = TASKS["image"]
+    model = nn.Model.from_config(description, n_in, n_out)
+    model.parameters.numpy()[model.n_matrix_params :] *= 1e4
+    module = torch_bindings.Module(model)
+    assert [name for name, _ in module.named_parameters()] == ["parameters_flat"]
+    # The slope of linear interpolation jumps from cell to cell: no sample so close to a border that float32 and float64
+    # could disagree on its cell.
+    samples = inputs(800, 2, low=0, high=1)
+    p = samples[:, None, :].astype(np.float64) * np.array(model.encoding.parts[0].layout.scales)[:, None] + 0.5
+    samples = samples[(np.abs(p - np.rint(p)) > 4e-7 * p).all(axis=(1, 2))]
+    assert len(samples) > 600
+    x = torch.from_numpy(samples).requires_grad_()
+    target = torch.from_numpy(inputs(len(samples), 3))
+    loss = torch.nn.functional.mse_loss(module(x), target)
+    loss.backward()
+    first = loss.item()
+
+    peer = Network(model.config, n_in, n_out).double()
+    peer.load(model.parameters.numpy(), model.n_matrix_params)
+    exact = x.detach().double().requires_grad_()
+    torch.nn.functional.mse_loss(peer(exact), target.double()).backward()
+    np.testing.assert_allclose(x.grad.numpy(), exact.grad.numpy(), atol=1e-4 * float(exact.grad.abs().max()))
+    assert (model.gradients.numpy() == 0).all()
+
+    optimizer = torch.optim.Adam(module.parameters(), 1e-2)
+    for _ in range(20):
+        optimizer.zero_grad()
+        loss = torch.nn.functional.mse_loss(module(x), target)
+        loss.backward()
+        optimizer.step()
+    assert loss.item() < 0.8 * first
+    np.testing.assert_array_equal(model.inference(x.detach().numpy()), module(x).detach().numpy())
+
+
+def test_benchmark_runs():
+    bench = Bench("image", 512, 1, compiled=False)
+    results = bench.run(1)
+    assert bench.error["ours"] < 1e-5
+    assert results["training"]["ours"]["samples_per_second"] > 0
