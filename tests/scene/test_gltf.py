@@ -12,7 +12,7 @@ import pytest
 from tools.gltf_writer import GltfBuilder
 from wavefront.errors import SceneError
 from wavefront.scene import description as d
-from wavefront.scene import gltf_document, load_scene, meshes
+from wavefront.scene import gltf, gltf_document, load_scene, meshes
 from wavefront.scene.gltf_accessors import read_accessor, read_primitive
 from wavefront.scene.gltf_graph import local_matrix, world_nodes
 
@@ -214,6 +214,34 @@ def test_a_mesh_used_twice_and_a_mirrored_one(builder, tmp_path):
         a, b, c = triangles.vertices[triangles.faces[0]]
         assert np.cross(b - a, c - a)[2] > 0  # outside stays outside
     np.testing.assert_array_equal(meshes.tessellate(scene.shapes[0]).vertices, TRIANGLE + np.float32((0, 0, 5)))
+
+
+def test_a_large_mesh_used_often_is_stored_once(builder, tmp_path):
+    """As instances, where the same nodes with a small mesh give copies; both are the same triangles."""
+    count = gltf.INSTANCED_TRIANGLES // 2
+    places = [[0, 0, 5], [0, 2, 0], [-3, 0, 0]]
+    for triangles in (count, count - 1):
+        points = np.tile(TRIANGLE, (triangles, 1)) + np.repeat(np.arange(triangles, dtype=np.float32), 3)[:, None]
+        mesh = builder.mesh(points, name="part")
+        nodes = [builder.add("nodes", mesh=mesh, translation=place, scale=[-1, 2, 1]) for place in places]
+        builder.scene(*nodes, name=str(triangles))
+    many, few = (load(builder, tmp_path, scene=str(n))[0] for n in (count, count - 1))
+    assert (len(many.groups), len(many.instances), len(many.shapes)) == (1, 3, 0)
+    assert (len(few.groups), len(few.instances), len(few.shapes)) == (0, 0, 3)
+    (shape,) = many.groups[0].shapes
+    assert shape.to_world == [] and shape.part.mesh == 0
+    for instance, copy, place in zip(many.instances, few.shapes, places, strict=True):
+        assert instance.group == many.groups[0].name
+        assert instance.to_world == copy.to_world
+        np.testing.assert_array_equal(np.array(instance.to_world)[:3, 3], place)
+
+
+def test_a_large_mesh_that_emits_is_copied(builder, tmp_path):
+    material = builder.add("materials", emissiveFactor=[1, 1, 1])
+    mesh = builder.mesh(np.tile(TRIANGLE, (gltf.INSTANCED_TRIANGLES, 1)), material=material)
+    builder.scene(builder.add("nodes", mesh=mesh), builder.add("nodes", mesh=mesh, translation=[0, 0, 1]))
+    scene, _ = load(builder, tmp_path)
+    assert len(scene.shapes) == 2 and not scene.groups
 
 
 def test_scenes_are_chosen_by_name_or_number(builder, tmp_path):

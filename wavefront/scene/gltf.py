@@ -4,6 +4,8 @@ Meshes and embedded images stay in the file: the records name it with the index 
 one to one: a lux is a W/m^2, a candela a W/sr, a candela per square metre of emission a W/(m^2 sr). So lights of all
 kinds keep their ratio, and the image is in candela per square metre.
 
+A large mesh that several nodes use becomes a group, which is stored once, and an instance per node.
+
 A spot light falls linearly with the angle between its cones, where the standard recommends the square of a ramp in
 the cosine: of the default cone (0 to 45 degrees) ours emits 2 % more.
 """
@@ -13,6 +15,7 @@ from __future__ import annotations
 import math
 import os
 import warnings
+from collections import Counter
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -28,6 +31,8 @@ from wavefront.scene.transforms import rows
 
 FILM_SIZE = 512  # of the longer side, in pixels: a glTF file has no resolution
 PARAMETERS = ("camera", "scene")
+# Copies of a mesh with fewer triangles than this, all together, are faster to trace than instances, and small.
+INSTANCED_TRIANGLES = 10_000
 _POINTS_AND_LINES = "points and lines are left out"
 
 
@@ -74,6 +79,8 @@ class _Importer:
         self.shape_names: set[str] = set()
         self.light_names: set[str] = set()
         self.shapes: list[description.Mesh] = []
+        self.groups: dict[int, description.Group] = {}  # by the index of the mesh
+        self.instances: list[description.Instance] = []
         self.emitters: list[description.Emitter] = []
         self.cameras: list[tuple[int, int, np.ndarray]] = []
 
@@ -92,10 +99,12 @@ class _Importer:
         if self.root.animations:
             self._note("animations", "animations are left out")
         scene = self._scene_index()
-        for index, matrix in world_nodes(self.document, scene):
+        nodes = list(world_nodes(self.document, scene))
+        uses = Counter(self.root.nodes[index].mesh for index, _ in nodes)
+        for index, matrix in nodes:
             node = self.root.nodes[index]
             if node.mesh is not None:
-                self._mesh(index, node, matrix)
+                self._mesh(index, node, matrix, uses[node.mesh])
             if node.extensions.light is not None:
                 self._light(index, node.extensions.light.light, matrix)
             if node.camera is not None:
@@ -108,6 +117,8 @@ class _Importer:
             film=film,
             bsdfs=self.materials.bsdfs,
             emitters=self.emitters,
+            groups=list(self.groups.values()),
+            instances=self.instances,
             description="" if chosen is None else self.root.scenes[chosen].name,
         )
 
@@ -127,7 +138,7 @@ class _Importer:
 
     # --- shapes -------------------------------------------------------------------------------------------------
 
-    def _mesh(self, index, node, matrix):
+    def _mesh(self, index, node, matrix, uses):
         mesh, place = self.document.item("meshes", node.mesh, f"nodes[{index}].mesh"), f"meshes[{node.mesh}]"
         if is_flat(matrix):
             self._note(f"nodes[{index}]", "is scaled to nothing; its mesh is left out")
@@ -136,31 +147,51 @@ class _Importer:
             self._note(f"nodes[{index}].skin", "skins are not supported: the mesh is in its bind pose")
         if any(primitive.targets for primitive in mesh.primitives) and any(node.weights or mesh.weights):
             self._note(place, "morph targets are not supported: the mesh is in its base shape")
-        for i, primitive in enumerate(mesh.primitives):
-            where = f"{place}.primitives[{i}]"
+        group = self.groups.get(node.mesh)
+        shapes = self._primitives(index, node) if group is None else []
+        emits = any(shape.emitter is not None for shape in shapes)
+        if group is None and shapes and not emits and (uses - 1) * self._triangles(mesh) >= INSTANCED_TRIANGLES:
+            names = {other.name for other in self.groups.values()}
+            group = description.Group(name=unique_name(mesh.name or place, names), shapes=shapes)
+            self.groups[node.mesh] = group
+        if group is None:
+            for shape in shapes:
+                shape.to_world = _transform(matrix)
+            self.shapes += shapes
+        else:
+            self.instances.append(description.Instance(group=group.name, name=node.name, to_world=_transform(matrix)))
+
+    def _triangles(self, mesh) -> int:
+        """About how many triangles a mesh has."""
+        primitives = [(p.indices, p.attributes.POSITION) for p in mesh.primitives]
+        used = [position if indices is None else indices for indices, position in primitives]
+        return sum(self.root.accessors[i].count for i in used if i is not None and i < len(self.root.accessors)) // 3
+
+    def _primitives(self, index, node) -> list[description.Mesh]:
+        """The mesh of a node, in its own space."""
+        shapes = []
+        for i, primitive in enumerate(self.root.meshes[node.mesh].primitives):
+            where = f"meshes[{node.mesh}].primitives[{i}]"
             if primitive.mode < TRIANGLES:
                 self._note(where, _POINTS_AND_LINES)
             elif primitive.attributes.POSITION is None:
                 self._note(where, "has no POSITION and is left out")
             else:
-                self._primitive(index, node, i, matrix)
+                shapes.append(self._primitive(index, node, i))
+        return shapes
 
-    def _primitive(self, index, node, i, matrix):
+    def _primitive(self, index, node, i) -> description.Mesh:
         mesh = self.root.meshes[node.mesh]
         primitive, where = mesh.primitives[i], f"meshes[{node.mesh}].primitives[{i}]"
         surface = self.materials.surface(primitive.material, f"{where}.material")
         if primitive.attributes.COLOR_0 is not None:
             self._note(where, "vertex colours are left out")
-        part = description.GltfPart(mesh=node.mesh, primitive=i, uv_set=surface.uv_set or 0)
-        self.shapes.append(
-            description.Mesh(
-                name=unique_name(node.name or mesh.name or f"node {index}", self.shape_names),
-                file=str(self.document.path),
-                part=part,
-                bsdf=surface.bsdf,
-                emitter=surface.emitter,
-                to_world=_transform(matrix),
-            )
+        return description.Mesh(
+            name=unique_name(node.name or mesh.name or f"node {index}", self.shape_names),
+            file=str(self.document.path),
+            part=description.GltfPart(mesh=node.mesh, primitive=i, uv_set=surface.uv_set or 0),
+            bsdf=surface.bsdf,
+            emitter=surface.emitter,
         )
 
     # --- lights -------------------------------------------------------------------------------------------------
