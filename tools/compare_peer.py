@@ -44,7 +44,7 @@ TILE_ROWS = 9
 BATCHES = 48  # of each renderer, about; their spread tells the noise
 LEAST_BATCHES = 16
 NOISY = 0.02  # width of an interval that says nothing
-OWN_SKY_SAMPLES = 64
+OWN_SKY_SAMPLES = 16
 SHEET_WIDTH = 1280  # pixels
 
 
