@@ -244,6 +244,18 @@ def test_a_large_mesh_that_emits_is_copied(builder, tmp_path):
     assert len(scene.shapes) == 2 and not scene.groups
 
 
+def test_orthographic_camera(builder, tmp_path):
+    view = {"xmag": 3.0, "ymag": 1.5, "znear": 0.1, "zfar": 9}
+    camera = builder.add("cameras", type="orthographic", orthographic=view)
+    builder.scene(builder.add("nodes", camera=camera, translation=[1, 2, 3], scale=[5, 5, 5]))
+    scene, _ = load(builder, tmp_path)
+    assert isinstance(scene.camera, d.Orthographic)
+    assert scene.camera.width == 6.0
+    assert (scene.film.width, scene.film.height) == (512, 256)
+    np.testing.assert_array_equal(np.array(scene.camera.to_world)[:, 3], (1, 2, 3, 1))
+    np.testing.assert_allclose(np.array(scene.camera.to_world)[:3, :3], np.eye(3), atol=1e-12)
+
+
 def test_scenes_are_chosen_by_name_or_number(builder, tmp_path):
     for x in range(3):
         builder.scene(builder.add("nodes", mesh=builder.mesh(TRIANGLE), translation=[x + 1, 0, 0]), name=f"s{x}")

@@ -245,10 +245,12 @@ class _Importer:
             label = self.root.cameras[camera_index].name or camera_index
             self._note("cameras", f"the scene has {len(self.cameras)} cameras; the first is used, {label!r}")
         camera, place = self.root.cameras[camera_index], f"cameras[{camera_index}]"
+        if getattr(camera, camera.type) is None:
+            raise self.document.error(place, f"has no {camera.type}")
         if camera.type == "orthographic":
-            raise self.document.error(place, "orthographic cameras are not supported; supported: perspective")
-        if camera.perspective is None:
-            raise self.document.error(place, "has no perspective")
+            size = camera.orthographic
+            record = description.Orthographic(width=2.0 * size.xmag, to_world=self._frame(matrix, node))
+            return record, _film(size.xmag / size.ymag)
         aspect = camera.perspective.aspect_ratio or 1.0
         record = description.Perspective(
             fov=math.degrees(camera.perspective.yfov), fov_axis="y", to_world=self._frame(matrix, node)

@@ -258,8 +258,8 @@ class PerspectiveCamera(_Object):
 
 
 class OrthographicCamera(_Object):
-    xmag: float
-    ymag: float
+    xmag: Positive
+    ymag: Positive
 
 
 class Camera(_Object):
