@@ -35,6 +35,7 @@ def test_every_feature():
     features = make_features(scene, upload_scene(scene, "cpu"))
     assert set(features.bsdfs) == set(KINDS)
     assert features.triangles and features.spheres and features.smooth and features.uvs and features.mask
+    assert features.media and features.tangents and len(features.maps) == len(features.instances) == 2
     assert {"triangle", "sphere", "sun", "directional", "point", "spot"} <= set(features.lights)
 
 

@@ -7,8 +7,10 @@ their number, and the ratio of the image means with its 95 % interval. A scene i
 false alarm rate of 1e-4 and the interval meets 1 +- 0.005; it is *noisy* if the interval is wider than 0.02.
 Next-event estimation, no Russian roulette, box filter. Media are compared with Mitsuba's `volpath`; its `path` ignores
 them. A `sunsky`, of which each renderer has a model of its own, is baked by Mitsuba, so that the transport is compared
-(`tools.bake`); ours is shown beside it. Pictures: ours, Mitsuba's, and where tiles differ (red: ours is brighter, blue:
-darker; full colour: 4 standard errors).
+(`tools.bake`); ours is shown beside it. Where rare paths carry most of the light (a caustic of a small light), the mean
+of an image says nothing for hours; `--clamp C` compares the means of single samples clamped at radiance C, which agree
+because both renderers sample in the same ways. Pictures: ours, Mitsuba's, and where tiles differ (red: ours is brighter,
+blue: darker; full colour: 4 standard errors).
 """
 
 from __future__ import annotations
@@ -46,6 +48,7 @@ LEAST_BATCHES = 16
 NOISY = 0.02  # width of an interval that says nothing
 OWN_SKY_SAMPLES = 16
 SHEET_WIDTH = 1280  # pixels
+SETTINGS = ("width", "max_depth", "error", "seconds", "clamp", "threads", "variant")
 
 
 @dataclasses.dataclass
@@ -106,6 +109,12 @@ class Row:
         }
 
 
+def clamped(singles: Iterator[np.ndarray], spp: int, limit: float) -> Iterator[np.ndarray]:
+    """Means over `spp` images of one sample per pixel each, of which every channel is clamped at `limit`."""
+    while True:
+        yield sum(np.minimum(next(singles), limit) for _ in range(spp)) / spp
+
+
 class Side:
     """One renderer's batches: their tile means, their mean image, and the time they took."""
 
@@ -154,6 +163,8 @@ def compare_scene(path: Path, arguments: argparse.Namespace, progress) -> Row:
     depth = min(scene.integrator.max_depth, arguments.max_depth)
     like_the_peer(scene, width, height, depth)
     integrator, notes, xml, own_sky = integrator_of(scene), [], path, None
+    if arguments.clamp is not None:
+        notes.append(f"samples clamped at {arguments.clamp:g}")
     if integrator != "path":
         notes.append(integrator)
     with tempfile.TemporaryDirectory(prefix="wavefront-peer-") as folder:
@@ -172,11 +183,16 @@ def _compare(name, scene, theirs, integrator, depth, tiles, note, own_sky, argum
 
     def our_source(spp):
         seed["calls"] += 1
-        return our_batches(scene, spp, f"{name} {seed['calls']}", threads=arguments.threads)
+        return source(our_batches, spp, scene, name=f"{name} {seed['calls']}", threads=arguments.threads)
 
     def their_source(spp):
         seed["calls"] += 1
-        return their_batches(theirs, depth, spp, seed["calls"] << 10, integrator)
+        return source(their_batches, spp, theirs, max_depth=depth, seed=seed["calls"] << 14, integrator=integrator)
+
+    def source(batches, spp, scene, **settings):
+        if arguments.clamp is None:
+            return batches(scene, spp=spp, **settings)
+        return clamped(batches(scene, spp=1, **settings), spp, arguments.clamp)
 
     progress(f"{name}: {film.width}x{film.height}, depth {depth}: warming up")
     sides = [
@@ -279,9 +295,7 @@ def write(folder: Path, rows: list[Row], arguments: argparse.Namespace) -> None:
     """``table.md``, ``figures.json``, a picture per scene, and all in ``sheet.jpg``."""
     account = {
         "machine": machine(),
-        "settings": {
-            name: getattr(arguments, name) for name in ("width", "max_depth", "error", "seconds", "threads", "variant")
-        },
+        "settings": {name: getattr(arguments, name) for name in SETTINGS},
         "scenes": [row.figures() for row in rows],
     }
     with replacing(folder / "table.md") as temporary:
@@ -318,6 +332,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--max-depth", type=int, default=12, metavar="N", help="at most; default 12")
     parser.add_argument("--error", type=float, default=0.001, metavar="E", help="of the ratio; default 0.001")
     parser.add_argument("--seconds", type=float, default=240.0, metavar="S", help="per scene, at most; default 240")
+    parser.add_argument("--clamp", type=float, default=None, metavar="C", help="radiance of a sample; default: none")
     parser.add_argument("--threads", type=int, default=None, metavar="N", help="of both; default: all cores")
     parser.add_argument("--variant", default=None, help="of Mitsuba; default llvm_ad_rgb where there is LLVM")
     return parser

@@ -11,6 +11,7 @@ from wavefront.scene.lookup import BSDF_FIELDS, TEXTURE_FIELDS, resolve_bsdf, re
 from wavefront.scene.transforms import to_matrix
 
 FAINT = 1e-20  # radiance of what is added
+ENVIRONMENTS = (description.Constant, description.Envmap, description.SunSky)  # of which a scene has one
 
 
 def with_every_feature(scene: description.Scene) -> description.Scene:
@@ -27,9 +28,13 @@ def with_every_feature(scene: description.Scene) -> description.Scene:
     size = 1e-4 * max(float(np.linalg.norm(camera)), 1e-3)
     corners = camera + size * (5.0 * back + np.eye(3))
     emitters: dict[type, description.Emitter] = {type(emitter): emitter for emitter in scene.emitters}
-    environment = any(isinstance(e, (description.Constant, description.Envmap)) for e in scene.emitters)
+    environment = any(isinstance(emitter, ENVIRONMENTS) for emitter in scene.emitters)
     blend = description.Blend(first=description.Dielectric(), second=description.Diffuse())
     scene.shapes.append(_triangle(corners, blend, None))  # of which there is no scene
+    scene.shapes[-1].interior = description.Homogeneous(sigma_a=1.0)
+    inside = [_triangle(corners, None, None), description.Sphere(center=tuple(corners[0]), radius=size)]
+    scene.groups.append(description.Group(name="every feature", shapes=inside))
+    scene.instances.append(description.Instance(group="every feature"))
     for file in sorted((ROOT / "scenes").glob("*.json")):
         donor = load_scene(file)
         for shape in donor.shapes:
@@ -42,7 +47,7 @@ def with_every_feature(scene: description.Scene) -> description.Scene:
                     added = _triangle(corners, bsdf, emitter)
                 scene.shapes.append(added)
         for emitter in donor.emitters:
-            surroundings = isinstance(emitter, (description.Constant, description.Envmap))
+            surroundings = isinstance(emitter, ENVIRONMENTS)
             if type(emitter) not in emitters and not (surroundings and environment):
                 environment |= surroundings
                 emitters[type(emitter)] = emitter
