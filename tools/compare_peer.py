@@ -9,8 +9,8 @@ Next-event estimation, no Russian roulette, box filter. Media are compared with 
 them. A `sunsky`, of which each renderer has a model of its own, is baked by Mitsuba, so that the transport is compared
 (`tools.bake`); ours is shown beside it. Where rare paths carry most of the light (a caustic of a small light), the mean
 of an image says nothing for hours; `--clamp C` compares the means of single samples clamped at radiance C, which agree
-because both renderers sample in the same ways. Pictures: ours, Mitsuba's, and where tiles differ (red: ours is brighter,
-blue: darker; full colour: 4 standard errors).
+because both renderers sample in the same ways. Pictures: ours, Mitsuba's, and where tiles differ (red: ours is
+brighter, blue: darker; full colour: 4 standard errors).
 """
 
 from __future__ import annotations
