@@ -22,7 +22,7 @@ from wavefront.bsdf.tables import MaterialTables
 from wavefront.camera import Camera, camera_kind, make_camera, make_camera_ray
 from wavefront.light.envmap import make_envmap
 from wavefront.light.sampling import make_light_sampler
-from wavefront.light.tables import KIND_CONSTANT, KIND_ENVMAP_FLOATS, LightTables
+from wavefront.light.tables import KIND_CONSTANT, LightTables
 from wavefront.light.tables import KINDS as LIGHT_KINDS
 from wavefront.renderer import Renderer
 from wavefront.rng import PURPOSE_BSDF, PURPOSE_CAMERA, PURPOSE_LIGHT, uniform4
@@ -31,7 +31,6 @@ from wavefront.texture import TextureTables, make_eval_parameter
 from wavefront.warp_samples import square_to_gaussian, square_to_tent
 
 TEXTURES = ("bytes", "checkerboard", "floats")
-LIGHTS = tuple(sorted(set(LIGHT_KINDS) - {"envmap_bytes", "envmap_halves"}))  # of environment maps, those of floats
 BOX, TENT, GAUSSIAN = wp.constant(0), wp.constant(1), wp.constant(2)
 CAMERAS = ("perspective", "thin_lens", "orthographic")
 THIN_LENS, ORTHOGRAPHIC = wp.constant(1), wp.constant(2)
@@ -73,6 +72,7 @@ def make_megakernel(
     maps: bool,
     nee: bool,
     instances: tuple[str, ...],
+    envmap: str,
 ):
     """Only what a scene lacks memory for is left out: kinds of primitive, vertex normals, UVs, tables of sampling."""
     perspective, thin_lens, orthographic = (make_camera_ray(kind) for kind in CAMERAS)
@@ -80,8 +80,10 @@ def make_megakernel(
     vertex_of = make_vertex(triangles, spheres, smooth, uvs, tangents, maps, instances)
     eval_bsdf, sample_bsdf, _ = make_bsdf(tuple(sorted(BSDF_KINDS)), True, TEXTURES, tangents, maps)
     mapped_frame = make_mapped_frame(TEXTURES, True)
-    sample_light, light_pdf = make_light_sampler(LIGHTS, TEXTURES)
-    eval_envmap, _ = make_envmap("floats", nee)
+    kinds = tuple(sorted(kind for kind in LIGHT_KINDS if not kind.startswith("envmap") or kind == f"envmap_{envmap}"))
+    sample_light, light_pdf = make_light_sampler(kinds, TEXTURES)
+    eval_envmap, _ = make_envmap(envmap, nee)
+    envmap_kind = wp.constant(LIGHT_KINDS[f"envmap_{envmap}"])
     eval_parameter = make_eval_parameter(TEXTURES)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -134,7 +136,7 @@ def make_megakernel(
                     if sky.kind == KIND_CONSTANT:
                         Le = lights.emitters[sky.emitter].radiance
                         b = sky.pmf / wp.static(4.0 * wp.pi)
-                    if sky.kind == KIND_ENVMAP_FLOATS:
+                    if sky.kind == envmap_kind:
                         found = eval_envmap(lights.envmap, direction)
                         Le = found.L
                         b = sky.pmf * found.pdf
@@ -241,7 +243,10 @@ def render_megakernel(renderer: Renderer, spp: int) -> np.ndarray:
     settings.seed = renderer.seed
     n = film.width * film.height * spp
     result = wp.zeros(n, dtype=wp.vec3, device="cpu")
-    kernel = make_megakernel(f.triangles, f.spheres, f.smooth, f.uvs, f.tangents, bool(f.maps), f.nee, f.instances)
+    envmap = "halves" if "envmap_halves" in f.lights else "floats"
+    kernel = make_megakernel(
+        f.triangles, f.spheres, f.smooth, f.uvs, f.tangents, bool(f.maps), f.nee, f.instances, envmap
+    )
     d = device_scene
     inputs = [make_camera(scene.camera, film), d.geometry, d.materials, d.textures, d.lights, settings]
     wp.launch(kernel, dim=n, inputs=inputs, outputs=[result], device="cpu")
