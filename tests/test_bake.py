@@ -48,8 +48,9 @@ def baked(folder):
 @pytest.fixture(scope="module")
 def theirs(folder):
     """Radiance of Mitsuba's own emitter from directions."""
-    if peer.missing("llvm_ad_rgb"):
-        pytest.skip("needs LLVM")
+    reason = peer.missing("llvm_ad_rgb")
+    if reason is not None:
+        pytest.skip(reason)
     mi = peer.use_variant("llvm_ad_rgb")
     emitter = bake._load(mi, folder / "scene.xml", {})
 
