@@ -163,9 +163,9 @@ def bias_lines(bias: BiasTest) -> list[str]:
     height, width = (np.diff(edges).max() for edges in bias.edges)
     count, what = rows * columns, "luminance" if bias.channels == "Y" else "R, G, B"
     lines = [
-        f"bias test ({what}; {columns}x{rows} tiles of {width}x{height} pixels or less; false alarm rate {bias.rate:g} in all): "
-        f"{bias.failing_tiles or 'none'} of {count} tiles {'differs' if bias.failing_tiles == 1 else 'differ'}; "
-        f"smallest p, corrected: {comparison.smallest_p:.2g}"
+        f"bias test of {what}: {bias.failing_tiles or 'none'} of {count} tiles "
+        f"{'differs' if bias.failing_tiles == 1 else 'differ'} ({columns}x{rows}, of {width}x{height} pixels or less; "
+        f"false alarm rate {bias.rate:g} in all); smallest p, corrected: {comparison.smallest_p:.2g}"
     ]
     ratio = bias.ratio()
     if ratio:

@@ -15,10 +15,11 @@ files of floats (Radiance HDR, TIFF) are radiance.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import OpenEXR
+import OpenImageIO as oiio
 
 from tools.metrics import check_finite
 from wavefront.errors import WavefrontError
@@ -81,34 +82,67 @@ def read_image(path: Path, layer: str | None = None) -> LoadedImage:
     return image
 
 
+class _Exr:
+    """An open OpenEXR file: its channels by name, with that of their part in front where two parts have the same."""
+
+    def __init__(self, path: Path):
+        # OpenImageIO, because the OpenEXR binding prints about damaged files
+        self.path, self.file = path, oiio.ImageInput.open(str(path))
+        if self.file is None or self.file.format_name() != "openexr":
+            raise WavefrontError(
+                f"{path}: cannot be read: {' '.join(oiio.geterror().split()) or 'not an OpenEXR file'}"
+            )
+        self.channels: dict[str, tuple[int, int]] = {}  # part, and place in it
+        self.specs = []
+        while self.file.seek_subimage(len(self.specs), 0):
+            spec, part = self.file.spec(), len(self.specs)
+            for i, name in enumerate(spec.channelnames):
+                self.channels[f"{spec.getattribute('name')}.{name}" if name in self.channels else name] = (part, i)
+            self.specs.append(spec)
+
+    def window(self, names: Sequence[str]) -> tuple[int, int, int, int]:
+        """Width, height, x and y of channels."""
+        specs = [self.specs[self.channels[name][0]] for name in names]
+        windows = {(spec.width, spec.height, spec.x, spec.y) for spec in specs}
+        if len(windows) > 1:
+            raise WavefrontError(f"{self.path}: the channels {', '.join(names)} have windows {sorted(windows)}")
+        return windows.pop()
+
+    def is_half(self, name: str) -> bool:
+        part, i = self.channels[name]
+        return self.specs[part].channelformat(i) == oiio.TypeDesc("half")
+
+    def read(self, names: Sequence[str]) -> np.ndarray:
+        """[h, w, len(names)], float32."""
+        width, height, *_ = self.window(names)
+        pixels = np.empty((height, width, len(names)), np.float32)
+        for c, name in enumerate(names):
+            part, i = self.channels[name]
+            channel = self.file.read_image(part, 0, i, i + 1, oiio.FLOAT)
+            if channel is None:
+                raise WavefrontError(f"{self.path}: cannot be read: {' '.join(self.file.geterror().split())}")
+            pixels[..., c] = channel[..., 0]
+        return pixels
+
+
 def _read_exr(path, layer):
-    channels, origin = _exr_channels(path)
-    names = _colour_channels(path, channels, layer)
-    shapes = {channels[name].shape for name in names}
-    if len(shapes) > 1:
-        raise WavefrontError(f"{path}: the channels {', '.join(names)} have different sizes {sorted(shapes)}")
-    half = any(channels[name].dtype == np.float16 for name in names)
-    pixels = np.stack([channels[name] for name in names], axis=-1, dtype=np.float32, casting="same_kind")
-    image = LoadedImage(path, np.broadcast_to(pixels, (*pixels.shape[:2], 3)), origin=origin, half=half)
-    return _with_variance(image, channels)
+    file = _Exr(path)
+    names = _colour_channels(path, list(file.channels), layer)
+    pixels = file.read(names)
+    image = LoadedImage(
+        path,
+        np.broadcast_to(pixels, (*pixels.shape[:2], 3)),
+        origin=file.window(names)[2:],
+        half=any(map(file.is_half, names)),
+    )
+    for variances, power in VARIANCES:
+        if all(name in file.channels for name in variances):
+            file.window([*names, *variances])  # the same
+            return _with_variance(image, variances, file.read(variances).astype(np.float64), power)
+    return image
 
 
-def _exr_channels(path) -> tuple[dict[str, np.ndarray], tuple[int, int]]:
-    """All channels by name, with that of their part in front where two parts have the same, and the first pixel."""
-    channels = {}
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            origin = file.header()["dataWindow"][0]
-            for part in file.parts:
-                for name, channel in part.channels.items():
-                    channels[f"{part.name()}.{name}" if name in channels else name] = np.asarray(channel.pixels)
-    except Exception as error:  # the binding raises RuntimeError, ValueError and others
-        text = " ".join(str(error).split()) or "not an OpenEXR file"
-        raise WavefrontError(f"{path}: cannot be read: {text}") from None
-    return channels, (int(origin[0]), int(origin[1]))
-
-
-def _colour_channels(path, channels: dict[str, np.ndarray], layer: str | None) -> list[str]:
+def _colour_channels(path: Path, channels: Sequence[str], layer: str | None) -> list[str]:
     """The three channels, or the one of a grey image, that hold the colours."""
     prefixes = [name[:-1] for name in channels if name[-2:] in ("R", ".R")]
     layers = [p[:-1] for p in prefixes if all(p + c in channels for c in "GB")]
@@ -132,19 +166,14 @@ def _colour_channels(path, channels: dict[str, np.ndarray], layer: str | None) -
     return [f"{layer}.{c}" if layer else c for c in "RGB"]
 
 
-def _with_variance(image: LoadedImage, channels: dict[str, np.ndarray]) -> LoadedImage:
-    for names, power in VARIANCES:
-        if not all(name in channels and channels[name].shape == image.pixels.shape[:2] for name in names):
-            continue
-        values = np.stack([channels[name] for name in names], axis=-1).astype(np.float64)
-        if np.isnan(values).all():
-            return dataclasses.replace(image, note=f"{image.path}: {names[0]} is NaN, as it is for one sample a pixel")
-        check_finite(values, image.path, names, image.origin)
-        if values.min() < 0.0:
-            y, x, c = np.unravel_index(values.argmin(), values.shape)
-            raise WavefrontError(
-                f"{image.path}: pixel ({x + image.origin[0]}, {y + image.origin[1]}), channel {names[c]}: "
-                f"{values[y, x, c]:g}; allowed: 0 or more"
-            )
-        return dataclasses.replace(image, variance=values**power)
-    return image
+def _with_variance(image: LoadedImage, names: Sequence[str], values: np.ndarray, power: int) -> LoadedImage:
+    if np.isnan(values).all():
+        return dataclasses.replace(image, note=f"{image.path}: {names[0]} is NaN, as it is for one sample a pixel")
+    check_finite(values, image.path, names, image.origin)
+    if values.min() < 0.0:
+        y, x, c = np.unravel_index(values.argmin(), values.shape)
+        raise WavefrontError(
+            f"{image.path}: pixel ({x + image.origin[0]}, {y + image.origin[1]}), channel {names[c]}: "
+            f"{values[y, x, c]:g}; allowed: 0 or more"
+        )
+    return dataclasses.replace(image, variance=values**power)
