@@ -202,8 +202,10 @@ def test_hdr_flip():
 def test_flip_of_darkness():
     """The library would end the process."""
     needs_flip()
-    with pytest.raises(WavefrontError, match="nowhere brighter than 0; needed: 1e-06"):
+    with pytest.raises(WavefrontError, match="the reference has luminance 0 at most; needed: 1e-06"):
         evaluate("flip", np.ones((4, 4, 3)), np.zeros((4, 4, 3)))
+    with pytest.raises(WavefrontError, match=r"has luminance 1\.4"):
+        evaluate("flip", np.ones((4, 4, 3)), np.full((4, 4, 3), [0.0, 0.0, 2e-6]))
     assert 0.0 < evaluate("flip", np.full((4, 4, 3), 2e-6), np.full((4, 4, 3), 1e-6)) <= 1.0
     assert 0.0 < evaluate("flip", np.ones((4, 4, 3)), np.zeros((4, 4, 3)), display=True) <= 1.0
 

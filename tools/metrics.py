@@ -30,6 +30,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from wavefront.errors import WavefrontError
+from wavefront.film import LUMINANCE
 
 RELMSE_EPSILON = 0.01
 MRSE_EPSILON = 1e-4
@@ -95,10 +96,10 @@ def _flip(image: np.ndarray, reference: np.ndarray, display: bool) -> np.ndarray
         raise MissingPackageError(
             "flip: the package flip-evaluator is not installed; it comes with pip install '.[flip]'"
         ) from None
-    if not display and reference.max(initial=0.0) < FLIP_DARKEST:  # the library would end the process
+    brightest = (np.maximum(reference, 0.0) @ np.asarray(LUMINANCE)).max()
+    if not display and brightest < FLIP_DARKEST:  # the library would end the process
         raise WavefrontError(
-            f"flip: the reference is nowhere brighter than {reference.max(initial=0.0):g}; needed: {FLIP_DARKEST:g}, "
-            "to choose exposures"
+            f"flip: the reference has luminance {brightest:g} at most; needed: {FLIP_DARKEST:g}, to choose exposures"
         )
     # Neither form is defined outside of these ranges; a filter with negative lobes leaves them.
     pair = [np.clip(pixels, 0.0, 1.0 if display else None).astype(np.float32) for pixels in (reference, image)]
