@@ -19,6 +19,7 @@ from tools.false_color import false_color
 from tools.image_reader import LoadedImage, read_image
 from tools.image_test import Comparison, Estimate, tile_means
 from tools.metrics import METRICS, error_map, evaluate
+from wavefront.errors import WavefrontError
 from wavefront.film import LUMINANCE
 from wavefront.scene.images import write_exr, write_exr_blocks, write_png
 
@@ -171,6 +172,8 @@ def test_pictures_are_decoded(tmp_path):
     expected = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
     np.testing.assert_allclose(picture.pixels, np.repeat(expected[:, :, None], 3, axis=2), rtol=1e-14)
     assert picture.display
+    with pytest.raises(WavefrontError, match=r"grey\.png: has no layer 'x'; allowed: layers of OpenEXR files"):
+        read_image(tmp_path / "grey.png", "x")
 
 
 def test_names_of_variances(tmp_path):
@@ -391,9 +394,7 @@ def test_a_pixel_that_is_not_finite(pair, tmp_path, capsys, value):
     a, _, image, _ = pair
     image[5, 7, 2] = value
     bad = save(tmp_path / "bad.exr", image)
-    expected = (
-        f"{bad}: pixel (7, 5), channel B: {value}, and 0 more values that are not finite; allowed: finite numbers"
-    )
+    expected = f"{bad}: pixel (7, 5), channel B: {value} (1 values are not finite); allowed: finite numbers"
     assert error_of(capsys, bad, a) == error_of(capsys, a, bad) == expected
     crop = tmp_path / "crop.exr"  # pixels are counted in the image, not in the window
     write_exr_blocks(crop, (30, 40, WIDTH, HEIGHT), (90, 90), dict.fromkeys("RGB", "float"), [layers(image)])
@@ -403,7 +404,7 @@ def test_a_pixel_that_is_not_finite(pair, tmp_path, capsys, value):
 @pytest.mark.parametrize(
     ("value", "expected"),
     [
-        (np.nan, "nan, and 0 more values that are not finite; allowed: finite numbers"),
+        (np.nan, "nan (1 values are not finite); allowed: finite numbers"),
         (-0.5, "-0.5; allowed: 0 or more"),
     ],
 )

@@ -74,6 +74,8 @@ def read_image(path: Path, layer: str | None = None) -> LoadedImage:
         image = _read_exr(path, layer)
     else:
         pixels = load_image(path)
+        if layer is not None:
+            raise WavefrontError(f"{path}: has no layer {layer!r}; allowed: layers of OpenEXR files")
         display = pixels.dtype.kind == "u"
         if display:
             pixels = srgb_to_linear(pixels / np.iinfo(pixels.dtype).max)

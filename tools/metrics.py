@@ -151,8 +151,8 @@ def check_finite(
     if bad.any():
         y, x, c = np.unravel_index(bad.argmax(), bad.shape)
         raise WavefrontError(
-            f"{what}: pixel ({x + origin[0]}, {y + origin[1]}), channel {channels[c]}: {pixels[y, x, c]}, and "
-            f"{bad.sum() - 1} more values that are not finite; allowed: finite numbers"
+            f"{what}: pixel ({x + origin[0]}, {y + origin[1]}), channel {channels[c]}: {pixels[y, x, c]} "
+            f"({bad.sum()} values are not finite); allowed: finite numbers"
         )
 
 
