@@ -226,7 +226,7 @@ def test_reference(name):
         like_the_peer(load_scene(Path(REAL_SCENES) / name / "scene.xml"), width, height, max_depth), 8, name
     )
     tiles = (9, 16) if width * 9 == height * 16 else (8, 8)
-    theirs = Estimate.from_errors(image, error, tiles)
+    theirs = Estimate.from_variance(image, error**2, tiles)
     check(f"{name}, reference", compare(ours, theirs, tiles, most=1024))
 
 

@@ -79,14 +79,9 @@ class Row:
         return float((self.comparison.p_values > 0.05).mean())
 
     @property
-    def smallest_p(self) -> float:
-        """Smallest p-value of a tile, corrected for the number of tests (Šidák)."""
-        return float(-np.expm1(self.comparison.error.size * np.log1p(-self.comparison.p_values.min())))
-
-    @property
     def verdict(self) -> str:
         low, high = self.comparison.interval()
-        if self.smallest_p < FALSE_ALARM_RATE or low > 1.0 + RATIO_TOLERANCE or high < 1.0 - RATIO_TOLERANCE:
+        if self.comparison.smallest_p < FALSE_ALARM_RATE or low > 1.0 + RATIO_TOLERANCE or high < 1.0 - RATIO_TOLERANCE:
             return "differs"
         return "noisy" if high - low > NOISY else "same"
 
@@ -101,7 +96,7 @@ class Row:
             "interval": self.comparison.interval(),
             "tiles": list(self.comparison.error.shape[:2]),
             "tiles_passed_at_95_percent": self.tiles_passed,
-            "smallest_p_corrected": self.smallest_p,
+            "smallest_p_corrected": self.comparison.smallest_p,
             "detectable_in_a_tile": self.comparison.detectable(),
             "samples_per_pixel": dict(zip(("ours", "mitsuba"), self.samples, strict=True)),
             "seconds": dict(zip(("ours", "mitsuba"), self.seconds, strict=True)),
@@ -278,7 +273,7 @@ def cells(row: Row) -> tuple[str, ...]:
         f"{ratio:.4f} ± {error:.4f}",
         f"{low:.4f} to {high:.4f}",
         f"{100.0 * row.tiles_passed:.1f} %",
-        f"{row.smallest_p:.2g}",
+        f"{row.comparison.smallest_p:.2g}",
         f"{100.0 * row.comparison.detectable():.1f} %",
         f"{row.samples[0]}, {row.samples[1]}",
         row.verdict,

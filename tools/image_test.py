@@ -2,9 +2,10 @@
 
 Both renderers are run in batches of independent samples. A batch gives one value per tile and channel, its mean over
 the tile, which is a mean over thousands of paths and so nearly normal; the spread over batches gives its variance
-without a model of either renderer. The tiles are compared by Welch's t-test, at a level that makes the false alarm
-rate of a whole comparison at most `FALSE_ALARM_RATE` (Šidák's inequality holds for correlated channels too). The seeds
-are fixed: a comparison that passes once passes always, until one of the renderers changes.
+without a model of either renderer. Of an image that is there already, the variances of its pixels take their place.
+The tiles are compared by Welch's t-test, at a level that makes the false alarm rate of a whole comparison at most
+`FALSE_ALARM_RATE` (Šidák's inequality holds for correlated channels too). The seeds are fixed: a comparison that passes
+once passes always, until one of the renderers changes.
 """
 
 from __future__ import annotations
@@ -20,19 +21,36 @@ RATIO_TOLERANCE = 0.005  # the 95 % confidence interval of the ratio of means mu
 ROUNDING = 2e-5  # of float32: left out of the difference of a tile before it is tested
 
 
-def tile_means(image: np.ndarray, tiles: tuple[int, int]) -> np.ndarray:
-    """Means over a grid of tiles.
+def tile_edges(size: int, count: int) -> np.ndarray:
+    """First pixels of `count` tiles that divide `size` pixels as evenly as can be, and the end: [count + 1]."""
+    return np.arange(count + 1) * size // count
+
+
+def tile_sums(image: np.ndarray, tiles: tuple[int, int]) -> np.ndarray:
+    """Sums over a grid of tiles.
 
     Args:
-        image: [H, W, 3], H and W multiples of the number of tiles.
-        tiles: Rows and columns of the grid.
+        image: [H, W, C].
+        tiles: Rows and columns of the grid, at most H and W.
 
     Returns:
-        [rows, columns, 3].
+        [rows, columns, C].
     """
-    (rows, columns), (height, width, channels) = tiles, image.shape
-    assert height % rows == 0 and width % columns == 0, (image.shape, tiles)
-    return image.reshape(rows, height // rows, columns, width // columns, channels).mean(axis=(1, 3))
+    (rows, columns), (height, width) = tiles, image.shape[:2]
+    assert 0 < rows <= height and 0 < columns <= width, (image.shape, tiles)
+    sums = np.add.reduceat(image, tile_edges(height, rows)[:-1], axis=0)
+    return np.add.reduceat(sums, tile_edges(width, columns)[:-1], axis=1)
+
+
+def tile_areas(shape: tuple[int, ...], tiles: tuple[int, int]) -> np.ndarray:
+    """Pixels of each tile of an image of this shape, [rows, columns, 1]."""
+    heights, widths = (np.diff(tile_edges(size, count)) for size, count in zip(shape[:2], tiles, strict=True))
+    return np.outer(heights, widths)[:, :, None]
+
+
+def tile_means(image: np.ndarray, tiles: tuple[int, int]) -> np.ndarray:
+    """Means over a grid of tiles, [rows, columns, C]; arguments as of `tile_sums`."""
+    return tile_sums(image, tiles) / tile_areas(image.shape, tiles)
 
 
 @dataclasses.dataclass
@@ -40,18 +58,20 @@ class Estimate:
     """What a renderer says of an image: means, the variances of these means, and how well the variances are known.
 
     Attributes:
-        tiles: Means of tiles, [rows, columns, 3].
+        tiles: Means of tiles, [rows, columns, C].
         variance: Of `tiles`.
-        degrees: Degrees of freedom of the variances.
-        means: Of the whole image: R, G, B, and all three together, [4].
+        degrees: Degrees of freedom of the variances, one or [rows, columns, C].
+        means: Of the whole image: each channel (R, G and B, or luminance alone), and all together, [C + 1].
         errors: Standard errors of `means`.
+        degrees_of_errors: Degrees of freedom of `errors`.
     """
 
     tiles: np.ndarray
     variance: np.ndarray
-    degrees: float
+    degrees: float | np.ndarray
     means: np.ndarray
     errors: np.ndarray
+    degrees_of_errors: float
 
     @classmethod
     def from_batches(cls, batches: Sequence[np.ndarray]) -> Estimate:
@@ -66,21 +86,38 @@ class Estimate:
             n - 1,
             whole.mean(axis=0),
             whole.std(axis=0, ddof=1) / np.sqrt(n),
+            n - 1,
         )
 
     @classmethod
-    def from_errors(cls, image: np.ndarray, error: np.ndarray, tiles: tuple[int, int]) -> Estimate:
-        """From an image and the standard error of every pixel, [H, W, 3] both, of many samples."""
-        pixels = image.shape[0] * image.shape[1]
-        means = image.mean(axis=(0, 1))
-        errors = np.sqrt((error**2).sum(axis=(0, 1))) / pixels
+    def from_variance(cls, image: np.ndarray, variance: np.ndarray, tiles: tuple[int, int]) -> Estimate:
+        """From an image and the estimated variance of every pixel's mean; pixels are independent.
+
+        How well the variance of a tile is known is taken from how it is spread over its pixels, by Satterthwaite's
+        formula (1946): (sum v)^2 / sum(v^2 / n) degrees of freedom, with n = 1 for a pixel, as if it had two samples.
+        A light path that few samples find makes one variance large and leaves others too small; where one pixel has
+        most of the variance of its tile, the tile says next to nothing, however many samples there were.
+
+        Args:
+            image: [H, W, C].
+            variance: Of `image`, the same shape, 0 where it is exact.
+            tiles: Rows and columns of the grid.
+        """
+        pixels, sums = image.shape[0] * image.shape[1], tile_sums(variance, tiles)
+        means, errors = image.mean(axis=(0, 1)), np.sqrt(variance.sum(axis=(0, 1))) / pixels
         return cls(
             tile_means(image, tiles),
-            tile_means(error**2, tiles) * (tiles[0] * tiles[1] / pixels),
-            np.inf,
+            sums / tile_areas(image.shape, tiles) ** 2,
+            degrees_of_sums(sums, tile_sums(np.square(variance), tiles)),
             np.append(means, means.mean()),
             np.append(errors, errors.mean()),  # as if the channels erred together: an upper bound
+            float(degrees_of_sums(variance.sum(axis=(0, 1)), np.square(variance).sum(axis=(0, 1))).min()),
         )
+
+
+def degrees_of_sums(sums: np.ndarray, squares: np.ndarray) -> np.ndarray:
+    """Degrees of freedom of sums of variances, of which the sums of squares are known too; infinite where all are 0."""
+    return np.divide(np.square(sums), squares, out=np.full_like(sums, np.inf), where=squares > 0.0)
 
 
 @dataclasses.dataclass
@@ -99,36 +136,42 @@ class Comparison:
 
     @property
     def error(self) -> np.ndarray:
-        """Standard error of the difference of tiles, [rows, columns, 3]."""
+        """Standard error of the difference of tiles, [rows, columns, C]."""
         return np.sqrt(self.a.variance + self.b.variance)
 
     @property
     def degrees(self) -> np.ndarray:
-        """Welch and Satterthwaite's degrees of freedom of the difference of tiles, [rows, columns, 3]."""
+        """Welch and Satterthwaite's degrees of freedom of the difference of tiles, [rows, columns, C]."""
         denominator = self.a.variance**2 / self.a.degrees + self.b.variance**2 / self.b.degrees
         return np.where(denominator > 0.0, self.error**4 / np.maximum(denominator, 1e-300), 1.0)
 
     @property
     def p_values(self) -> np.ndarray:
-        """Two-sided, [rows, columns, 3]."""
+        """Two-sided, [rows, columns, C]."""
         difference = np.abs(self.a.tiles - self.b.tiles) - self.rounding * np.maximum(self.a.tiles, self.b.tiles)
         difference, error = np.maximum(difference, 0.0), self.error
         t = np.divide(difference, error, out=np.where(difference > 0.0, np.inf, 0.0), where=error > 0.0)
         return 2.0 * stats.t.sf(t, self.degrees)
 
+    @property
+    def smallest_p(self) -> float:
+        """Smallest p-value of a tile, corrected for the number of tests (Šidák)."""
+        p = self.p_values.min()
+        return 1.0 if p == 1.0 else float(-np.expm1(self.error.size * np.log1p(-p)))
+
     def level(self, rate: float = FALSE_ALARM_RATE) -> float:
         """Level of the test of one tile and channel."""
-        return 1.0 - (1.0 - rate) ** (1.0 / self.error.size)
+        return float(-np.expm1(np.log1p(-rate) / self.error.size))
 
-    def ratio(self, channel: int = 3) -> tuple[float, float]:
-        """Ratio of the image means, of one channel or (3) of all, and its standard error (first order)."""
+    def ratio(self, channel: int = -1) -> tuple[float, float]:
+        """Ratio of the image means, of one channel or (-1) of all, and its standard error (first order)."""
         a, b = self.a.means[channel], self.b.means[channel]
         return float(a / b), float(a / b * np.hypot(self.a.errors[channel] / a, self.b.errors[channel] / b))
 
     def interval(self, confidence: float = 0.95) -> tuple[float, float]:
         """Confidence interval of the ratio of the image means."""
         ratio, error = self.ratio()
-        half = error * stats.t.isf((1.0 - confidence) / 2.0, min(self.a.degrees, self.b.degrees))
+        half = error * stats.t.isf((1.0 - confidence) / 2.0, min(self.a.degrees_of_errors, self.b.degrees_of_errors))
         return float(ratio - half), float(ratio + half)
 
     def detectable(self, power: float = 0.9) -> float:
@@ -145,8 +188,8 @@ class Comparison:
         return (
             f"ratio {ratio:.5f} ± {error:.5f}, 95 % interval [{low:.5f}, {high:.5f}]; smallest p {p.min():.1e} at tile "
             f"and channel {tuple(map(int, np.unravel_index(p.argmin(), p.shape)))}, level {self.level():.1e}; "
-            f"degrees of freedom {self.a.degrees} and {self.b.degrees}; finds a difference of "
-            f"{100.0 * self.detectable():.2g} % in a tile"
+            f"degrees of freedom {np.median(self.a.degrees):.4g} and {np.median(self.b.degrees):.4g}; finds a "
+            f"difference of {100.0 * self.detectable():.2g} % in a tile"
         )
 
     def check(self, tolerance: float = RATIO_TOLERANCE) -> None:
