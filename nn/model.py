@@ -90,7 +90,9 @@ class Model:
         self.parameters = wp.array(values, dtype=wp.float32, device=device)
         self.gradients = wp.zeros(self.n_params, dtype=wp.float32, device=device)
         clipping = cfg.gradient_clipping.global_norm if cfg.gradient_clipping else 0.0
-        self.optimizer = optimizers.Optimizer(cfg.optimizer, self.n_params, offset, cfg.loss_scale, clipping, device)
+        self.optimizer = optimizers.Optimizer(
+            cfg.optimizer, self.n_params, offset, cfg.loss_scale, clipping, device, not tiles
+        )
         if self.optimizer.ema:
             wp.copy(self.optimizer.averages, self.parameters)
         self._workers = Workers(threads)

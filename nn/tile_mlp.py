@@ -9,6 +9,9 @@ A training block takes its tiles one after the other and adds their weight gradi
 sums do not depend on timing. What the hidden layers gave it keeps in a scratch of its own, which stays in the L2 cache.
 
 The CPU device runs the same kernels in tests, one launch at a time: its tiles share one static arena.
+
+Warp leaves functions that are arguments of `tile_map` out of the hash of a module, unless they are static expressions:
+`wp.static` around them keeps kernels that differ in nothing else apart.
 """
 
 import dataclasses
@@ -119,7 +122,7 @@ def make_functions(shape: Shape):
     @wp.func
     def load_operand(a: wp.array2d[wp.float32], row: int, block: int, h: Operand):
         """A block of columns; zeros beyond the array."""
-        wp.tile_assign(h, wp.tile_map(operand, wp.tile_load(a, shape=(M, T), offset=(row, block * T))))
+        wp.tile_assign(h, wp.tile_map(wp.static(operand), wp.tile_load(a, shape=(M, T), offset=(row, block * T))))
 
     @wp.func
     def begin(biases: wp.array2d[wp.float32], row: int, z: Sum):
@@ -153,7 +156,7 @@ def make_functions(shape: Shape):
     def accumulate_biases(g: Operand, dL_dbiases: wp.array2d[wp.float32], row: int):
         """Adds the sums of columns to the gradients of biases."""
         if wp.static(bias):
-            sums = wp.tile_sum(wp.tile_map(single, g), axis=0)
+            sums = wp.tile_sum(wp.tile_map(wp.static(single), g), axis=0)
             total = wp.tile_load(dL_dbiases[row], shape=T, offset=0)
             wp.tile_store(dL_dbiases[row], total + sums, offset=0)
             synchronize()
@@ -178,10 +181,10 @@ def make_functions(shape: Shape):
                     multiply(h, net.weights, block, z, wp.where(block == 0, BETA, 1.0))
             else:
                 multiply(h, net.weights, net.n_in + layer - 1, z, BETA)
-            v = wp.tile_map(value, z)
+            v = wp.tile_map(wp.static(value), z)
             if kept >= 0:
                 wp.tile_store(values, v, offset=(kept + layer * M, 0))
-            wp.tile_assign(h, wp.tile_map(activation, v))
+            wp.tile_assign(h, wp.tile_map(wp.static(activation), v))
 
     @wp.func
     def output_layer(features: wp.array2d[wp.float32], row: int, net: Network, block: int, h: Operand, z: Sum):
@@ -218,7 +221,7 @@ def make_infer_kernel(shape: Shape):
         hidden_layers(features, row, net, h, z, net.weights, -1)
         for block in range(net.n_out):
             output_layer(features, row, net, block, h, z)
-            wp.tile_store(y, wp.tile_map(output, z), offset=(row, block * T))
+            wp.tile_store(y, wp.tile_map(wp.static(output), z), offset=(row, block * T))
 
     return infer
 
@@ -254,12 +257,12 @@ def make_train_kernel(shape: Shape, loss):
 
     @wp.func
     def load_activations(values: wp.array2d[dtype], row: int, h: f.Operand):
-        wp.tile_assign(h, wp.tile_map(activation, wp.tile_load(values, shape=(M, T), offset=(row, 0))))
+        wp.tile_assign(h, wp.tile_map(wp.static(activation), wp.tile_load(values, shape=(M, T), offset=(row, 0))))
 
     @wp.func
     def multiply_by_slopes(z: f.Sum, values: wp.array2d[dtype], row: int, g: f.Operand):
         """Gradients with respect to hidden sums from those with respect to what the layer gave."""
-        wp.tile_assign(g, wp.tile_map(slope, z, wp.tile_load(values, shape=(M, T), offset=(row, 0))))
+        wp.tile_assign(g, wp.tile_map(wp.static(slope), z, wp.tile_load(values, shape=(M, T), offset=(row, 0))))
 
     @wp.func
     def write_input_gradient(

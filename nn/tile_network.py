@@ -68,11 +68,10 @@ class TileNetwork:
 
     def load(self, loss) -> None:
         """Builds the kernels of inference, and of training with `loss`."""
-        wp.force_load(
-            device=self.device,
-            modules=[self.infer_kernel.module, make_train_kernel(self.shape, loss).kernel.module],
-            block_dim=self._threads,
-        )
+        train = make_train_kernel(self.shape, loss).kernel
+        wp.force_load(device=self.device, modules=[self.infer_kernel.module, train.module], block_dim=self._threads)
+        small = [self.pack_kernel, make_pack_kernel(wp.float32), add_chunks]
+        wp.force_load(device=self.device, modules=list({kernel.module for kernel in small}))
 
     @property
     def _threads(self):
