@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import warp as wp
 
@@ -33,8 +35,8 @@ def as_input(array: Array, width: int, name: str, device) -> wp.array:
     return wp.array(array, dtype=wp.float32, device=device, copy=False)
 
 
-def as_output(out: Array | None, n: int, width: int, like: Array, device) -> tuple[wp.array, Array]:
-    """An array ``[n, width]`` to write to, and what the caller gets for it: `out`, or a new one of `like`'s kind.
+def as_output(out: Array | None, n: int, width: int, like: Array, device) -> tuple[wp.array, Callable[[], Array]]:
+    """An array ``[n, width]`` to write to, and a function that then gives the caller `out`, or a new one like `like`.
 
     Raises:
         NnError: `out` cannot be written to in place.
@@ -42,34 +44,44 @@ def as_output(out: Array | None, n: int, width: int, like: Array, device) -> tup
     if out is None:
         if isinstance(like, wp.array):
             array = empty((n, width), device)
-            return array, array
+            return array, lambda: array
         out = np.empty((n, width), np.float32)
     if tuple(out.shape) != (n, width):
         raise NnError(f"out: found shape {tuple(out.shape)}; allowed: {(n, width)}")
     if isinstance(out, wp.array):
         if out.dtype != wp.float32 or not out.is_contiguous or out.device != device:
             raise NnError(f"out: allowed: a contiguous float32 array on {device}")
-        return out, out
+        return out, lambda: out
     if out.dtype != np.float32 or not out.flags.c_contiguous or not out.flags.writeable:
         raise NnError("out: allowed: a contiguous float32 array that can be written")
     if n == 0:
-        return empty((0, width), device), out
-    return wp.array(out, dtype=wp.float32, device=device, copy=False), out
+        return empty((0, width), device), lambda: out
+    if device.is_cpu:
+        return wp.array(out, dtype=wp.float32, device=device, copy=False), lambda: out
+    array = empty((n, width), device)
+
+    def finish():
+        out[...] = array.numpy()
+        return out
+
+    return array, finish
 
 
 def as_index(index: Array, n: int, most: int, name: str, device) -> wp.array:
-    """`n` row numbers below `most`, as int32.
+    """`n` row numbers below `most`, as int32. Those on a GPU are not read back: kernels leave NaN for wrong ones.
 
     Raises:
         NnError: Its length, type or a number is not allowed.
     """
+    checked = device.is_cpu or not isinstance(index, wp.array)
     if not isinstance(index, wp.array):
         index = wp.array(np.ascontiguousarray(index, np.int32), dtype=wp.int32, device=device)
     if index.shape != (n,) or index.dtype != wp.int32:
         raise NnError(f"{name}: found an index of shape {index.shape}; allowed: {n} whole numbers")
-    values = index.numpy()
-    if n and (values.min() < 0 or values.max() >= most):
-        raise NnError(f"{name}: found indices from {values.min()} to {values.max()}; allowed: 0 to {most - 1}")
+    if n and checked:
+        values = index.numpy()
+        if values.min() < 0 or values.max() >= most:
+            raise NnError(f"{name}: found indices from {values.min()} to {values.max()}; allowed: 0 to {most - 1}")
     return index
 
 

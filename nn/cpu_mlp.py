@@ -15,6 +15,7 @@ import warp as wp
 
 from nn.activations import RELU, activate, derivative
 
+PRECISIONS = ("fp32", "fp16", "bf16")  # by code
 BLOCK = 128  # rows; a multiple of 8
 N_CHUNKS = 16  # of a batch, whose weight gradients are summed in order: the same sums for any number of threads
 # Columns of the layer table.
@@ -128,6 +129,45 @@ def write_rows(
 ): ...
 
 
+@wp.func_native("""
+    unsigned int* const bits = (unsigned int*)(a.data + offset);
+    float* const values = a.data + offset;
+    if (precision == 1)
+        for (int i = 0; i < n; ++i) {
+            const float x = values[i], size = __builtin_fabsf(x);
+            // to 10 bits of mantissa; to a multiple of 2^-24 below 2^-14, by the rounding of a sum
+            const unsigned int even = (bits[i] + 0x0fffu + ((bits[i] >> 13) & 1u)) & ~0x1fffu;
+            const float small = __builtin_copysignf((size + 0.75f) - 0.75f, x);
+            float y = size < 6.103515625e-5f ? small : __builtin_bit_cast(float, even);
+            y = size >= 65520.0f ? __builtin_copysignf(__builtin_inff(), x) : y;
+            values[i] = x != x ? x : y;
+        }
+    if (precision == 2)
+        for (int i = 0; i < n; ++i) {
+            const unsigned int even = (bits[i] + 0x7fffu + ((bits[i] >> 16) & 1u)) & ~0xffffu;
+            values[i] = values[i] != values[i] ? values[i] : __builtin_bit_cast(float, even);
+        }
+""")
+def round_to_precision(a: wp.array[wp.float32], offset: wp.int64, n: int, precision: int):
+    """Rounds `n` numbers to the nearest of half precision (1) or bfloat16 (2), ties to even."""
+    ...
+
+
+@wp.func_native("""
+    for (int i = 0; i < n; ++i)
+        to.data[to_offset + i] = (add ? to.data[to_offset + i] : 0.0f) + factor * source.data[offset + i];
+""")
+def write_scaled(
+    source: wp.array[wp.float32],
+    offset: int,
+    n: int,
+    factor: wp.float32,
+    add: int,
+    to: wp.array[wp.float32],
+    to_offset: wp.int64,
+): ...
+
+
 @wp.struct
 class Network:
     """A network as the kernels read it."""
@@ -138,6 +178,7 @@ class Network:
     gradient: int  # offset in a scratch of two blocks that hold dL/dy of a layer
     gradient_stride: int  # size of each
     gradient_size: int  # floats of one chunk of weight gradients
+    precision: int  # of the operands of products
 
 
 @wp.kernel
@@ -149,9 +190,10 @@ def pack(parameters: wp.array[wp.float32], offsets: wp.array2d[wp.int32], net: N
     n_in = net.table[layer, N_IN]
     weight = offsets[layer, 0] + o * n_in
     for i in range(n_in):
-        w = parameters[weight + i]
-        net.packed[net.table[layer, WT] + i * net.table[layer, OUT_PAD] + o] = w
-        net.packed[net.table[layer, W] + o * net.table[layer, IN_PAD] + i] = w
+        at = net.table[layer, W] + o * net.table[layer, IN_PAD] + i
+        net.packed[at] = parameters[weight + i]
+        round_to_precision(net.packed, wp.int64(at), 1, net.precision)
+        net.packed[net.table[layer, WT] + i * net.table[layer, OUT_PAD] + o] = net.packed[at]
     if net.table[layer, HAS_BIAS] != 0:
         net.packed[net.table[layer, BIAS] + o] = parameters[offsets[layer, 1] + o]
 
@@ -167,6 +209,8 @@ def forward_block(
 ):
     """Activations of `rows` rows into the scratch at `base`; `first` is the offset of the first row of `encoded`."""
     m = (rows + 7) / 8 * 8
+    hidden = net.table.shape[0] - 1
+    round_to_precision(encoded, first, m * net.table[0, IN_PAD], net.precision)
     for layer in range(net.table.shape[0]):
         out_pad = net.table[layer, OUT_PAD]
         code = net.table[layer, ACTIVATION]
@@ -192,9 +236,13 @@ def forward_block(
                 scratch, before, net.table[layer, IN_PAD], 1, net.packed, wt, out_pad, bias, scratch, to, out_pad, m,
                 out_pad, k, 0, relu, scratch, to,
             )  # fmt: skip
+        if layer < hidden:
+            round_to_precision(scratch, wp.int64(target), m * out_pad, net.precision)
         if code > RELU:
             for i in range(m * out_pad):
                 scratch[out + i] = activate(code, scratch[target + i])
+            if layer < hidden:
+                round_to_precision(scratch, wp.int64(out), m * out_pad, net.precision)
 
 
 @wp.func
@@ -208,11 +256,12 @@ def backward_block(
     dL_dweights: wp.array[wp.float32],
     chunk: wp.int64,
     want_input: int,
+    feature_factor: wp.float32,
     dL_dencoded: wp.array[wp.float32],
 ):
     """From dL/d(output) in the first gradient block of the scratch to weights (added) and features.
 
-    `want_input`: 0 leaves dL/dencoded alone, 1 writes it, 2 adds to it.
+    `want_input`: 0 leaves dL/dencoded alone, 1 writes it, 2 adds to it, times `feature_factor`.
     """
     m = (rows + 7) / 8 * 8
     n_layers = net.table.shape[0]
@@ -221,6 +270,7 @@ def backward_block(
     code = net.table[n_layers - 1, ACTIVATION]
     if code != 0:
         multiply_by_derivative(net, n_layers - 1, m, scratch, base, current)
+    round_to_precision(scratch, wp.int64(current), m * net.table[n_layers - 1, OUT_PAD], net.precision)
     for step in range(n_layers):
         layer = n_layers - 1 - step
         in_pad = net.table[layer, IN_PAD]
@@ -251,14 +301,21 @@ def backward_block(
             )  # fmt: skip
             if code > RELU:
                 multiply_by_derivative(net, layer - 1, m, scratch, base, other)
+            round_to_precision(scratch, wp.int64(other), m * in_pad, net.precision)
             swap = current
             current = other
             other = swap
-        elif want_input != 0:
+        elif want_input != 0 and feature_factor == 1.0:
             multiply(
                 scratch, wp.int64(current), out_pad, 1, net.packed, w, in_pad, -1, dL_dencoded, first, in_pad, m,
                 in_pad, n_out, wp.where(want_input == 2, 1, 0), 0, scratch, wp.int64(0),
             )  # fmt: skip
+        elif want_input != 0:
+            multiply(
+                scratch, wp.int64(current), out_pad, 1, net.packed, w, in_pad, -1, scratch, wp.int64(other), in_pad, m,
+                in_pad, n_out, 0, 0, scratch, wp.int64(0),
+            )  # fmt: skip
+            write_scaled(scratch, other, m * in_pad, feature_factor, want_input - 1, dL_dencoded, first)
 
 
 @wp.func
@@ -316,6 +373,8 @@ def make_train_kernel(loss):
         scratch: wp.array[wp.float32],
         target: wp.array2d[wp.float32],
         scale: wp.array[wp.float64],
+        scale_factor: wp.float64,
+        feature_factor: wp.float32,
         want_input: int,
         # out
         y: wp.array2d[wp.float32],
@@ -323,6 +382,8 @@ def make_train_kernel(loss):
         dL_dweights: wp.array[wp.float32],
         dL_dencoded: wp.array[wp.float32],
     ):
+        """Gradients inside the network are `scale` times `scale_factor` times those of the loss, summed over rows and
+        outputs."""
         chunk = first_chunk + wp.tid()
         blocks = (n_rows + wp.static(BLOCK - 1)) / BLOCK
         block = wp.int32(wp.int64(blocks) * wp.int64(chunk) / wp.int64(n_chunks))
@@ -333,9 +394,7 @@ def make_train_kernel(loss):
         stride = net.table[last, OUT_PAD]
         n_out = net.table[last, N_OUT]
         gradient = base + net.gradient
-        factor = wp.float32(scale[0])
-        if wp.static(loss is not None):
-            factor = wp.float32(scale[0] / (wp.float64(n_rows) * wp.float64(n_out)))
+        factor = wp.float32(scale[0] * scale_factor)
         total = wp.float64(0.0)
         while block < end:
             row = block * BLOCK
@@ -366,6 +425,7 @@ def make_train_kernel(loss):
                 dL_dweights,
                 wp.int64(chunk) * wp.int64(net.gradient_size),
                 want_input,
+                feature_factor,
                 dL_dencoded,
             )
             block += 1
@@ -379,11 +439,15 @@ def add_chunks(
     net: Network,
     offsets: wp.array2d[wp.int32],
     n_chunks: int,
+    factor: wp.float64,
     # in and out
     dL_dweights: wp.array[wp.float32],
     gradients: wp.array[wp.float32],
 ):
-    """Adds the chunks, in order, to the gradients of all parameters; threads: layers × outputs of the widest."""
+    """Adds the chunks, in order and times a factor, to the gradients of all parameters.
+
+    Threads: layers × outputs of the widest.
+    """
     layer, o = wp.tid()
     if o >= net.table[layer, N_OUT]:
         return
@@ -399,7 +463,7 @@ def add_chunks(
         total = wp.float64(0.0)
         for chunk in range(n_chunks):
             total += wp.float64(dL_dweights[chunk * net.gradient_size + at])
-        gradients[where] = gradients[where] + wp.float32(total)
+        gradients[where] = gradients[where] + wp.float32(total * factor)
 
 
 def n_blocks(n: int) -> int:

@@ -20,6 +20,7 @@ from nn.cpu_mlp import (
     N_OUT,
     OUT_PAD,
     OUTPUT,
+    PRECISIONS,
     WT,
     Network,
     W,
@@ -41,10 +42,11 @@ class CpuNetwork:
         offset: Of its first parameter among all.
         stride: Of the rows of encoded features, a multiple of 16; columns beyond `mlp.n_in` are not read.
         device: The CPU device.
+        precision: Of the operands of products: ``fp32``, or ``fp16`` and ``bf16``, which are float32 rounded to it.
     """
 
-    def __init__(self, mlp: MLP, offset: int, stride: int, device):
-        self.mlp, self.device = mlp, device
+    def __init__(self, mlp: MLP, offset: int, stride: int, device, precision: str):
+        self.mlp, self.device, self.precision = mlp, device, PRECISIONS.index(precision)
         table, offsets = [], []
         packed = gradient = scratch = widest = 0
         for layer in mlp.layers:
@@ -73,10 +75,14 @@ class CpuNetwork:
         self.gradient, self.gradient_stride = scratch, BLOCK * widest
         self.scratch_size = scratch + 2 * BLOCK * widest
 
+    def load(self, loss) -> None:
+        """Builds the kernels of inference, and of training with `loss`."""
+        wp.force_load(device=self.device, modules=[infer.module, make_train_kernel(loss).module])
+
     def pack(self, parameters: wp.array) -> Network:
         """The network with these parameters (a copy of them)."""
         net = Network()
-        net.table = self.table
+        net.table, net.precision = self.table, self.precision
         net.packed = wp.zeros(self.packed_size, dtype=wp.float32, device=self.device)
         net.scratch_size, net.gradient_size = self.scratch_size, self.gradient_size
         net.gradient, net.gradient_stride = self.gradient, self.gradient_stride
@@ -94,8 +100,11 @@ class CpuNetwork:
 
     def differentiate(
         self, net, encoded, n, loss, target, y, encode, scale, want_input, gradients, dL_dencoded, workers, buffers
-    ) -> float:
-        """Forward pass, loss and backward pass over a batch of `n` rows; adds to `gradients`.
+    ) -> wp.array:
+        """Forward pass, loss and backward pass over a batch of at least one row; adds to `gradients`.
+
+        In half precision gradients inside the network are not divided by the size of the batch, which would make them
+        vanish: their sums are.
 
         Args:
             net: From `pack`.
@@ -112,11 +121,11 @@ class CpuNetwork:
             buffers: Lends scratch.
 
         Returns:
-            The mean loss; 0 without a loss.
+            Parts of the sum of the loss over rows and outputs.
         """
-        if n == 0:
-            return 0.0
         kernel = make_train_kernel(loss)
+        mean = 1.0 / (n * self.mlp.n_out) if loss is not None else 1.0
+        inside, outside = (1.0, mean) if self.precision else (mean, 1.0)
         losses = wp.zeros(N_CHUNKS, dtype=wp.float64, device=self.device)
         size = N_CHUNKS * self.gradient_size
         with self.lend_scratch(workers, buffers) as scratch, buffers.lend(("chunks", id(self)), size) as chunks:
@@ -126,13 +135,17 @@ class CpuNetwork:
                 end = min(n_blocks(n) * (first + count) // N_CHUNKS * BLOCK, n)
                 if encode is not None and end > row:
                     encode(row, end, worker)
-                inputs = [encoded, n, first, N_CHUNKS, net, worker, scratch, target, scale, want_input]
+                inputs = [encoded, n, first, N_CHUNKS, net, worker, scratch, target, scale, inside]
                 wp.launch(
-                    kernel, dim=count, inputs=inputs, outputs=[y, losses, chunks, dL_dencoded], device=self.device
+                    kernel,
+                    dim=count,
+                    inputs=[*inputs, outside, want_input],
+                    outputs=[y, losses, chunks, dL_dencoded],
+                    device=self.device,
                 )
 
             workers.run(work, N_CHUNKS, 1 if n > 2048 else N_CHUNKS)
-            inputs = [net, self.offsets, N_CHUNKS]
+            inputs = [net, self.offsets, N_CHUNKS, outside]
             wp.launch(add_chunks, dim=self.outputs, inputs=inputs, outputs=[chunks, gradients], device=self.device)
             chunks.zero_()
-        return float(losses.numpy().sum()) / (n * self.mlp.n_out) if loss is not None else 0.0
+        return losses

@@ -14,16 +14,16 @@ import numpy as np
 import warp as wp
 
 from nn import config as c
-from nn import cpu_mlp as execute
 from nn import optimizers
 from nn.arrays import Array, as_index, as_input, as_output, check_rows, empty
-from nn.cpu_mlp import BLOCK, make_train_kernel, n_blocks
+from nn.cpu_mlp import BLOCK, n_blocks
 from nn.cpu_network import CpuNetwork
 from nn.encodings import Encoding
 from nn.encodings.kernels import count_nonfinite_rows, gather_columns
 from nn.errors import ConfigError, NnError
 from nn.losses import make_loss
 from nn.mlp import MLP
+from nn.tile_network import TileNetwork
 from nn.workers import Buffers, Workers, available_cores
 
 _ALIGNMENT = 8  # of a grid's first parameter, in floats
@@ -41,13 +41,18 @@ class Model:
     """
 
     def __init__(
-        self, cfg: c.ModelConfig, n_input_dims: int, n_output_dims: Sequence[int], device, seed: int, threads: int
+        self,
+        cfg: c.ModelConfig,
+        n_input_dims: int,
+        n_output_dims: Sequence[int],
+        device,
+        seed: int,
+        threads: int,
+        tiles: bool,
     ):
         self.config, self.device = cfg, device
         self.n_input_dims, self.n_output_dims = n_input_dims, list(n_output_dims)
-        if cfg.precision != "fp32":
-            raise ConfigError("precision", f'found "{cfg.precision}"; allowed on the CPU device: "fp32"')
-        self.encoding = Encoding(cfg.encoding, n_input_dims, device)
+        self.encoding = Encoding(cfg.encoding, n_input_dims, device, blocks=not tiles)
         records = cfg.network if isinstance(cfg.network, list) else [cfg.network]
         self.networks, self._executions, offset = [], [], 0
         for i, (record, n_out) in enumerate(zip(records, self.n_output_dims, strict=True)):
@@ -61,7 +66,12 @@ class Model:
                 n_features = sum(part.n_features for part in self.encoding.parts[: record.n_parts])
             network = MLP(record, n_features, n_out)
             self.networks.append(network)
-            self._executions.append(CpuNetwork(network, offset, self.encoding.stride, device))
+            execution = (
+                TileNetwork(network, offset, self.encoding.stride, device, cfg.precision, path)
+                if tiles
+                else CpuNetwork(network, offset, self.encoding.stride, device, cfg.precision)
+            )
+            self._executions.append(execution)
             offset += network.n_params
         if cfg.loss.__struct_config__.tag == "RelativeL2Luminance" and any(n % 3 for n in self.n_output_dims):
             raise ConfigError("loss.otype", "RelativeL2Luminance needs RGB: n_output_dims a multiple of 3")
@@ -80,7 +90,9 @@ class Model:
         self.parameters = wp.array(values, dtype=wp.float32, device=device)
         self.gradients = wp.zeros(self.n_params, dtype=wp.float32, device=device)
         clipping = cfg.gradient_clipping.global_norm if cfg.gradient_clipping else 0.0
-        self.optimizer = optimizers.Optimizer(cfg.optimizer, self.n_params, offset, cfg.loss_scale, clipping, device)
+        self.optimizer = optimizers.Optimizer(
+            cfg.optimizer, self.n_params, offset, cfg.loss_scale, clipping, device, not tiles
+        )
         if self.optimizer.ema:
             wp.copy(self.optimizer.averages, self.parameters)
         self._workers = Workers(threads)
@@ -91,13 +103,9 @@ class Model:
 
     def _load_modules(self, loss):
         """Builds all kernels before threads could race for them."""
-        kernels = [
-            execute.infer,
-            count_nonfinite_rows,
-            optimizers.decide,
-            self.optimizer.kernel,
-            make_train_kernel(loss),
-        ]
+        for execution in self._executions:
+            execution.load(loss)
+        kernels = [count_nonfinite_rows, optimizers.decide, self.optimizer.kernel]
         kernels += [kernel for part in self.encoding.parts for kernel in part.kernels()]
         wp.force_load(
             device=self.device, modules=list({kernel.module.name: kernel.module for kernel in kernels}.values())
@@ -112,6 +120,7 @@ class Model:
         device: str | None = "cpu",
         seed: int = 0,
         threads: int | None = None,
+        execution: str | None = None,
     ) -> Model:
         """Builds a model.
 
@@ -122,14 +131,18 @@ class Model:
             device: A Warp device.
             seed: Of the first parameters.
             threads: On the CPU device; None: as many as there are cores. Results do not depend on it.
+            execution: ``"blocks"`` (of samples, by threads of the CPU device; the default there) or ``"tiles"`` (in
+                shared memory, by thread blocks; the default on CUDA, and on the CPU device a slow way to test it).
 
         Raises:
             ConfigError: With the path in the configuration, what was found, and what is allowed.
         """
         cfg = c.load(cfg)
         device = wp.get_device(device)
-        if not device.is_cpu:
-            raise NnError(f"device {device}: networks run on the CPU device only so far")
+        allowed = ("blocks", "tiles") if device.is_cpu else ("tiles",)
+        execution = allowed[0] if execution is None else execution
+        if execution not in allowed:
+            raise NnError(f"execution: found {execution!r}; allowed on {device}: {', '.join(allowed)}")
         several = isinstance(cfg.network, list)
         dims = list(n_output_dims) if isinstance(n_output_dims, Sequence) else [n_output_dims]
         if several and len(dims) != len(cfg.network):
@@ -140,8 +153,9 @@ class Model:
             raise NnError(f"n_output_dims: found {n_output_dims}; allowed: a positive number for each network")
         if not isinstance(n_input_dims, (int, np.integer)) or n_input_dims < 1:
             raise NnError(f"n_input_dims: found {n_input_dims}; allowed: a positive number")
-        threads = available_cores() if threads is None else max(int(threads), 1)
-        return cls(cfg, int(n_input_dims), [int(n) for n in dims], device, seed, threads)
+        tiles = execution == "tiles"
+        threads = 1 if tiles else available_cores() if threads is None else max(int(threads), 1)
+        return cls(cfg, int(n_input_dims), [int(n) for n in dims], device, seed, threads, tiles)
 
     # Inference ------------------------------------------------------------------------------------------------------
 
@@ -173,7 +187,7 @@ class Model:
         """
         parameters = self.inference_parameters if averaged else self.parameters
         rows = as_input(x, self.n_input_dims, "x", self.device)
-        y, given = as_output(out, rows.shape[0], self.n_output_dims[network], x, self.device)
+        y, finish = as_output(out, rows.shape[0], self.n_output_dims[network], x, self.device)
         found = {}
         for part, (latent, index) in (latents or {}).items():
             piece, name = self.encoding.parts[self._part_index(part)], f"latents[{part}]"
@@ -181,7 +195,7 @@ class Model:
             found[part] = (latent, as_index(index, rows.shape[0], latent.shape[0], name, self.device))
         with self._lend_encoded(rows.shape[0]) as flat:
             self._evaluate(rows, flat, parameters, network, y, found)
-        return given
+        return finish()
 
     def _evaluate(self, rows, flat, parameters, network, y, latents=None):
         """Outputs of a network into `y`, and features into `flat`; returns the packed network."""
@@ -211,7 +225,7 @@ class Model:
         """
         piece = self.encoding.parts[self._part_index(part)]
         rows = as_input(x, piece.n_dims, "x", self.device)
-        latent, given = as_output(None, rows.shape[0], piece.n_features, x, self.device)
+        latent, finish = as_output(None, rows.shape[0], piece.n_features, x, self.device)
         parameters = self.inference_parameters if averaged else self.parameters
 
         def work(first, n, worker):
@@ -219,19 +233,19 @@ class Model:
             piece.forward(rows, row, end - row, 0, parameters, latent, 0)
 
         self._workers.run(work, n_blocks(rows.shape[0]), 16)
-        return given
+        return finish()
 
     # Training -------------------------------------------------------------------------------------------------------
 
     def forward(self, x: Array, network: int = 0) -> Array:
         """Evaluates a network with the parameters that are being trained, and remembers `x` for `backward`."""
         rows = as_input(x, self.n_input_dims, "x", self.device)
-        y, given = as_output(None, rows.shape[0], self.n_output_dims[network], x, self.device)
+        y, finish = as_output(None, rows.shape[0], self.n_output_dims[network], x, self.device)
         self._release()
         flat = self._buffers.take("encoded", self._encoded_size(rows.shape[0]))
         net = self._evaluate(rows, flat, self.parameters, network, y)
         self._kept = (rows, flat, net, network)
-        return given
+        return finish()
 
     def backward(self, dL_dy: Array, input_gradient: bool = False) -> Array | None:
         """Adds to `gradients` from the gradient of a loss with respect to the outputs of the last `forward`.
@@ -248,14 +262,19 @@ class Model:
         rows, flat, net, network = self._kept
         target = as_input(dL_dy, self.n_output_dims[network], "dL_dy", self.device)
         check_rows(target, rows)
-        wp.load_module(make_train_kernel(None).module, device=self.device)
+        self._executions[network].load(None)
         nothing = empty((0, 0), self.device)
         _, dL_dx = self._differentiate(rows, flat, {network: net}, None, {network: (target, nothing)}, input_gradient)
         return dL_dx if dL_dx is None or isinstance(dL_dy, wp.array) else dL_dx.numpy()
 
     def compute_gradients(
-        self, x: Array, target: Array | Sequence[Array], loss=None, outputs: Array | Sequence[Array] | None = None
-    ) -> float:
+        self,
+        x: Array,
+        target: Array | Sequence[Array],
+        loss=None,
+        outputs: Array | Sequence[Array] | None = None,
+        report: bool = True,
+    ) -> float | None:
         """Forward pass, loss and backward pass in one; adds to `gradients`.
 
         Args:
@@ -263,27 +282,38 @@ class Model:
             target: ``[n, n_output_dims]``, or one for each network.
             loss: A loss of one's own (see `nn.losses`); None: the one of the configuration.
             outputs: Where to write the outputs, if they are wanted.
+            report: False: do not read the loss back, which waits for a GPU.
 
         Returns:
             The loss: the mean over samples and outputs, summed over networks. A loss of one's own is normalised alike.
+            None without `report`.
         """
         if loss is None:
             loss = make_loss(self.config.loss.__struct_config__.tag)
-        wp.load_module(make_train_kernel(loss).module, device=self.device)
+        for execution in self._executions:
+            execution.load(loss)
         rows = as_input(x, self.n_input_dims, "x", self.device)
         n = rows.shape[0]
         several = isinstance(self.config.network, list)
         targets = list(target) if several else [target]
         written = (list(outputs) if several else [outputs]) if outputs is not None else [None] * len(self.networks)
-        jobs = {}
-        for i, (one, y) in enumerate(zip(targets, written, strict=True)):
+        jobs, finishes = {}, []
+        for i, (one, out) in enumerate(zip(targets, written, strict=True)):
             one = as_input(one, self.n_output_dims[i], "target", self.device)
             check_rows(one, rows)
-            y = as_output(y, n, self.n_output_dims[i], x, self.device)[0] if y is not None else None
-            jobs[i] = (one, empty((0, 0), self.device) if y is None else y)
+            y = empty((0, 0), self.device)
+            if out is not None:
+                y, finish = as_output(out, n, self.n_output_dims[i], x, self.device)
+                finishes.append(finish)
+            jobs[i] = (one, y)
         nets = {i: execution.pack(self.parameters) for i, execution in enumerate(self._executions)}
         with self._lend_encoded(n) as flat:
-            return self._differentiate(rows, flat, nets, loss, jobs, False, encode=True)[0]
+            losses, _ = self._differentiate(rows, flat, nets, loss, jobs, False, encode=True)
+        for finish in finishes:
+            finish()
+        if not report:
+            return None
+        return sum(_sum(array) / (n * self.n_output_dims[i]) for i, array in losses.items())
 
     def train_step(
         self,
@@ -292,6 +322,7 @@ class Model:
         *,
         dL_dy: Array | None = None,
         loss=None,
+        report: bool = True,
     ) -> float | None:
         """`compute_gradients` and `optimizer_step`.
 
@@ -300,20 +331,21 @@ class Model:
             target: Of the loss.
             dL_dy: Instead of `target`: the gradient of the caller's own loss with respect to the outputs.
             loss: As in `compute_gradients`.
+            report: As in `compute_gradients`.
 
         Returns:
-            The loss before the step; None with `dL_dy`.
+            The loss before the step; None with `dL_dy` or without `report`.
         """
         if (target is None) == (dL_dy is None):
             raise NnError("train_step: found both or neither of target and dL_dy; allowed: one of them")
         if dL_dy is None:
-            value = self.compute_gradients(x, target, loss)
+            value = self.compute_gradients(x, target, loss, report=report)
         else:
             value = None
             rows = as_input(x, self.n_input_dims, "x", self.device)
             given = as_input(dL_dy, self.n_output_dims[0], "dL_dy", self.device)
             check_rows(given, rows)
-            wp.load_module(make_train_kernel(None).module, device=self.device)
+            self._executions[0].load(None)
             nothing = empty((0, 0), self.device)
             nets = {0: self._executions[0].pack(self.parameters)}
             with self._lend_encoded(rows.shape[0]) as flat:
@@ -330,17 +362,17 @@ class Model:
         self.gradients.zero_()
 
     def _differentiate(self, rows, flat, nets, loss, jobs, input_gradient, encode=False):
-        """Adds all gradients; returns the loss and dL/dx or None."""
-        n, value, dL_dx = rows.shape[0], 0.0, None
+        """Adds all gradients; returns parts of the loss of each network, and dL/dx or None."""
+        n, losses, dL_dx = rows.shape[0], {}, None
         want_features = input_gradient or self.encoding.n_params > 0
 
         def encode_rows(row, end, worker):
             self._encode(rows, row, end, worker, self.parameters, self._as_rows(flat))
 
         with self._buffers.lend("dL_dencoded", self._encoded_size(n) if want_features else 1) as dL_dflat:
-            for order, (i, net) in enumerate(nets.items()):
+            for order, (i, net) in enumerate(nets.items() if n else ()):
                 target, y = jobs[i]
-                value += self._executions[i].differentiate(
+                losses[i] = self._executions[i].differentiate(
                     net, flat, n, loss, target, y, encode_rows if encode and order == 0 else None,
                     self.optimizer.loss_scale, (2 if order else 1) if want_features else 0, self.gradients, dL_dflat,
                     self._workers, self._buffers,
@@ -358,7 +390,7 @@ class Model:
                         part.backward_inputs(rows, row, end - row, self.parameters, dL_dencoded, dL_dx)
 
                 self._workers.run(work, n_blocks(n), 16)
-        return value, dL_dx
+        return losses, dL_dx
 
     # State ----------------------------------------------------------------------------------------------------------
 
@@ -453,3 +485,8 @@ class Model:
         if not isinstance(part, (int, np.integer)) or not 0 <= part < len(self.encoding.parts):
             raise NnError(f"part: found {part!r}; allowed: 0 to {len(self.encoding.parts) - 1}")
         return int(part)
+
+
+def _sum(array):
+    """The sum of a float64 array; only the sum of one on a GPU is copied."""
+    return float(array.numpy().sum() if array.device.is_cpu else wp.utils.array_sum(array.flatten()))

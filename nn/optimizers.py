@@ -22,6 +22,7 @@ STEP, SKIPPED, LOSS_SCALE, GOOD_STEPS, LEARNING_RATE, GRADIENT_FACTOR, SKIP, EMA
 )
 STATE_SIZE = 12
 N_RANGES = 64  # of gradients whose squares are summed apart; fixed, so that sums do not depend on threads
+N_STRIDED = 1 << 14  # of them on a GPU, each of every so many-th gradient
 GROWTH_INTERVAL = 2000.0
 LARGEST_LOSS_SCALE = 2.0**24
 SMALLEST_LOSS_SCALE = 2.0**-24
@@ -79,10 +80,22 @@ def measure(gradients: wp.array[wp.float32], first_range: int, sums: wp.array[wp
 
 
 @wp.kernel
+def measure_strided(gradients: wp.array[wp.float32], sums: wp.array[wp.float64]):
+    """As `measure`, of every so many-th gradient, so that neighbouring threads read neighbours."""
+    total = wp.float64(0.0)
+    i = wp.tid()
+    while i < gradients.shape[0]:
+        g = wp.float64(gradients[i])
+        total += g * g
+        i += wp.static(N_STRIDED)
+    sums[wp.tid()] = total
+
+
+@wp.kernel
 def decide(sums: wp.array[wp.float64], h: Hyperparameters, state: wp.array[wp.float64]):
     """Advances the state by one batch; one thread."""
     total = wp.float64(0.0)
-    for i in range(N_RANGES):
+    for i in range(sums.shape[0]):
         total += sums[i]
     scale = state[LOSS_SCALE]
     norm = wp.sqrt(total) / scale
@@ -255,9 +268,12 @@ class Optimizer:
         loss_scale: A factor, or ``"dynamic"``.
         max_norm: Of all gradients together; 0: no clipping.
         device: Where the arrays live.
+        blocks: A thread takes blocks of parameters, as suits the CPU device, not one.
     """
 
-    def __init__(self, cfg: c.Optimizer, n_params: int, n_matrix: int, loss_scale, max_norm: float, device):
+    def __init__(
+        self, cfg: c.Optimizer, n_params: int, n_matrix: int, loss_scale, max_norm: float, device, blocks: bool
+    ):
         h = Hyperparameters()
         self.ema = False
         while isinstance(cfg, (c.EMA, c.ExponentialDecay)):
@@ -289,23 +305,29 @@ class Optimizer:
         self.second_moments = wp.zeros(size, dtype=wp.float32, device=device)
         self.steps = wp.zeros(size, dtype=wp.int32, device=device)
         self.averages = wp.zeros(n_params if self.ema else 0, dtype=wp.float32, device=device)
-        self.sums = wp.zeros(N_RANGES, dtype=wp.float64, device=device)
+        self.sums = wp.zeros(N_RANGES if blocks else N_STRIDED, dtype=wp.float64, device=device)
+        self.total = self.sums if blocks else wp.zeros(1, dtype=wp.float64, device=device)
         state = np.zeros(STATE_SIZE)
         state[LOSS_SCALE] = 2.0**15 if loss_scale == "dynamic" else loss_scale
         self.state = wp.array(state, dtype=wp.float64, device=device)
         self.loss_scale = self.state[LOSS_SCALE : LOSS_SCALE + 1]
-        self.elements = 4096 if self.device.is_cpu else 1
+        self.elements = 4096 if blocks else 1
+        self.blocks = blocks
         self.kernel = make_step(self.adam, self.ema, self.elements)
 
     def step(self, parameters: wp.array, gradients: wp.array, parallel) -> None:
         """One update; `gradients` are zero afterwards. `parallel(launch, n)` spreads launches over threads."""
-        parallel(
-            lambda first, n, worker: wp.launch(
-                measure, dim=n, inputs=[gradients, first], outputs=[self.sums], device=self.device
-            ),
-            N_RANGES,
-        )
-        wp.launch(decide, dim=1, inputs=[self.sums, self.hyperparameters], outputs=[self.state], device=self.device)
+        if self.blocks:
+            parallel(
+                lambda first, n, worker: wp.launch(
+                    measure, dim=n, inputs=[gradients, first], outputs=[self.sums], device=self.device
+                ),
+                N_RANGES,
+            )
+        else:
+            wp.launch(measure_strided, dim=N_STRIDED, inputs=[gradients], outputs=[self.sums], device=self.device)
+            wp.utils.array_sum(self.sums, out=self.total)
+        wp.launch(decide, dim=1, inputs=[self.total, self.hyperparameters], outputs=[self.state], device=self.device)
         arrays = [self.first_moments, self.second_moments, self.steps, self.averages]
         parallel(
             lambda first, n, worker: wp.launch(

@@ -1,21 +1,25 @@
 """Speed and accuracy of the networks, against PyTorch with the same architecture in the same run.
 
-    python -m tools.bench_nn [--sizes 14 16] [--threads N] [--rounds 5] [--json FILE]
+    python -m tools.bench_nn [--device cuda] [--precision fp32 fp16 bf16] [--sizes 14 16] [--rounds 5] [--json FILE]
 
 Three tasks: ``npm``, the network of Neural Parametric Mixtures (dense grid, spherical harmonics and one-blob into
 3 × 64, 32 outputs); ``mlp``, its network alone; ``image``, the hash grid and network of `tools.fit_image`. Training is
-a whole step: forward, mean square error, backward, Adam over all parameters, and the moving average. Rounds of both
-engines take turns; the median counts. First calls, which compile, are not timed.
+a whole step: forward, mean square error, backward, Adam over all parameters, and the moving average. Rounds of all
+engines take turns; the median counts. First calls, which compile, are timed apart. Engines of one row group have one
+precision: half precision is autocast in PyTorch; on CUDA, PyTorch also runs float32 with TF32 products.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
 import time
 
 import numpy as np
+import warp as wp
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -65,17 +69,23 @@ TASKS = {
 }  # fmt: skip
 
 
-def timed(call) -> float:
+def timed(call, synchronize) -> float:
     start = time.perf_counter()
     call()
+    synchronize()
     return time.perf_counter() - start
 
 
-def gemm_rate(torch, size: int = 1536, rounds: int = 5) -> float:
-    """Floating-point operations per second of a large float32 matrix product in PyTorch (BLAS)."""
-    a, b = torch.rand(size, size), torch.rand(size, size)
+def gemm_rate(torch, device: str, precision: str, rounds: int = 5) -> float:
+    """Floating-point operations per second of a large matrix product in PyTorch."""
+    size = 1536 if device == "cpu" else 8192
+    dtype = {"fp16": torch.float16, "bf16": torch.bfloat16}.get(precision, torch.float32)
+    torch.backends.cuda.matmul.allow_tf32 = False
+    a, b = (torch.rand(size, size, device=device).to(dtype) for _ in range(2))
+    synchronize = torch.cuda.synchronize if device != "cpu" else (lambda: None)
     torch.mm(a, b)
-    return 2.0 * size**3 / min(timed(lambda: torch.mm(a, b)) for _ in range(rounds))
+    synchronize()
+    return 2.0 * size**3 / min(timed(lambda: torch.mm(a, b), synchronize) for _ in range(rounds))
 
 
 def relative_error(values: np.ndarray, reference: np.ndarray) -> float:
@@ -84,57 +94,81 @@ def relative_error(values: np.ndarray, reference: np.ndarray) -> float:
 
 
 class Bench:
-    """One task at one batch size, in both engines.
+    """One task at one batch size and precision, in all engines.
 
     Args:
         task: A key of `TASKS`.
         n: Samples in a batch.
-        threads: Of both engines.
+        precision: ``fp32``, ``fp16`` or ``bf16``.
+        device: ``cpu`` or a CUDA device.
+        threads: Of all engines, on the CPU device.
         compiled: Compare with `torch.compile` too.
     """
 
-    def __init__(self, task: str, n: int, threads: int, compiled: bool):
+    def __init__(self, task: str, n: int, precision: str, device: str, threads: int, compiled: bool):
         import torch
 
         from tools.bench_nn_torch import Network, Trainer
 
         description, n_in, n_out = TASKS[task]
-        self.n, cfg = n, config.load(description)
-        self.model = nn.Model.from_config(cfg, n_in, n_out, threads=threads)
+        self.n, self.device, self.missing = n, device, {}
+        cfg = config.load({**description, "precision": precision})
+        self.model = nn.Model.from_config(cfg, n_in, n_out, device=device, threads=threads)
         values = self.model.parameters.numpy()
         values[self.model.n_matrix_params :] *= 1e4  # features of a trained size, for the accuracy
+        self.model.parameters.assign(values)
         rng = np.random.default_rng(0)
-        self.x, self.target = rng.random((n, n_in), np.float32), rng.random((n, n_out), np.float32)
+        x, target = rng.random((n, n_in), np.float32), rng.random((n, n_out), np.float32)
+        ours = [wp.array(a, dtype=wp.float32, device=device) for a in (x, target)]
+        self.synchronize = (lambda: None) if device == "cpu" else (lambda: wp.synchronize_device(device))
         self.calls = {
-            "ours": (lambda: self.model.train_step(self.x, self.target), lambda: self.model.inference(self.x))
+            "ours": (lambda: self.model.train_step(*ours, report=False), lambda: self.model.inference(ours[0]))
         }
-        x, target = torch.from_numpy(self.x), torch.from_numpy(self.target)
-        some = slice(0, 4096)
         exact = Network(cfg, n_in, n_out).double()
         exact.load(values, self.model.n_matrix_params)
+        some = x[:4096]
         with torch.inference_mode():
-            reference = exact(x[some].double()).numpy()
-        self.error = {"ours": relative_error(self.model.inference(self.x[some], averaged=False), reference)}
-        for engine, compile_it in (("eager", False), ("compile", True))[: 2 if compiled else 1]:
+            reference = exact(torch.from_numpy(some).double()).numpy()
+        self.error = {"ours": relative_error(self.model.inference(some, averaged=False), reference)}
+        theirs = [torch.from_numpy(a).to(device) for a in (x, target)]
+        torch._dynamo.reset()  # what it compiled for other batches counts against a limit
+        kinds = [("eager", False, precision)]
+        if device != "cpu" and precision == "fp32":
+            kinds.append(("eager, TF32", False, "tf32"))
+        if compiled:
+            kinds += [(name.replace("eager", "compile"), True, kind) for name, _, kind in kinds]
+        for engine, compile_it, kind in kinds:
             network = Network(cfg, n_in, n_out)
             network.load(values, self.model.n_matrix_params)
-            trainer = Trainer(network, cfg, compile_it)
-            self.error[engine] = relative_error(trainer.infer(x[some]).numpy(), reference)
+            trainer = Trainer(network.to(device), cfg, compile_it, kind)
+            try:
+                first = trainer.infer(theirs[0])[:4096].cpu().numpy()
+            except Exception as error:  # torch.compile needs a compiler, and says so in exceptions of many kinds
+                self.missing[engine] = str(error).strip().splitlines()[0]
+                continue
+            self.error[engine] = relative_error(first, reference)
             self.calls[engine] = (
-                lambda trainer=trainer: trainer.train(x, target),
-                lambda trainer=trainer: trainer.infer(x),
+                lambda trainer=trainer: trainer.train(*theirs),
+                lambda trainer=trainer: trainer.infer(theirs[0]),
             )
 
     def run(self, rounds: int) -> dict:
         """Seconds of training steps and inferences of every engine, and what follows from them."""
-        seconds = {engine: {"training": [], "inference": []} for engine in self.calls}
-        for engine_calls in self.calls.values():
-            for call in engine_calls:
-                call()
+        modes = ("training", "inference")
+        seconds = {engine: {mode: [] for mode in modes} for engine in self.calls}
+        first, repeats = {}, {}
+        for engine, calls in self.calls.items():
+            for mode, call in zip(modes, calls, strict=True):
+                first[engine, mode] = timed(call, self.synchronize)
+                once = timed(call, self.synchronize)
+                # a GPU works while the next launches are prepared, as in real use
+                repeats[engine, mode] = 1 if self.device == "cpu" else max(1, min(200, int(0.05 / once)))
         for _ in range(rounds):
-            for engine, (train, infer) in self.calls.items():
-                seconds[engine]["training"].append(timed(train))
-                seconds[engine]["inference"].append(timed(infer))
+            for engine, calls in self.calls.items():
+                for mode, call in zip(modes, calls, strict=True):
+                    times = repeats[engine, mode]
+                    whole = timed(lambda call=call, times=times: [call() for _ in range(times)], self.synchronize)
+                    seconds[engine][mode].append(whole / times)
         flops = self.model.networks[0].flops_per_sample()
         work = {"training": 3 * flops, "inference": flops}
         results = {}
@@ -144,6 +178,7 @@ class Bench:
                 figure = spread(seconds[engine][mode])
                 results[mode][engine] = {
                     "seconds": figure,
+                    "first_call_seconds": first[engine, mode],
                     "samples_per_second": self.n / figure["median"],
                     "network_flops": self.n * operations / figure["median"],
                     "relative_error": self.error[engine],
@@ -154,22 +189,32 @@ class Bench:
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tools.bench_nn", description=__doc__.partition("\n")[0])
     parser.add_argument("--tasks", nargs="+", choices=list(TASKS), default=list(TASKS))
+    parser.add_argument("--device", default="cpu", help="cpu (the default) or cuda")
+    parser.add_argument("--precision", nargs="+", choices=["fp32", "fp16", "bf16"], help="default: fp32; on cuda, all")
     parser.add_argument(
-        "--sizes", nargs="+", type=int, default=[14, 16, 18], metavar="N", help="batches of 2^N samples"
+        "--sizes", nargs="+", type=int, metavar="N", help="batches of 2^N samples; default: 14 16 18, on cuda 14 to 21"
     )
-    parser.add_argument("--threads", type=int, default=available_cores(), help="of both engines")
+    parser.add_argument("--threads", type=int, default=available_cores(), help="of all engines, on the CPU device")
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--compile", action="store_true", help="also torch.compile, which needs a C++ compiler")
+    parser.add_argument("--no-compile", action="store_true", help="leave out torch.compile, which needs a C++ compiler")
     parser.add_argument("--json", metavar="FILE", help="write all figures")
     options = parser.parse_args(arguments)
     console = Console()
+    try:
+        device = wp.get_device(options.device)
+    except (RuntimeError, ValueError) as error:
+        print(f"error: --device {options.device}: {error}", file=sys.stderr)
+        return 2
+    on_cpu = device.is_cpu
+    options.sizes = options.sizes or ([14, 16, 18] if on_cpu else list(range(14, 22)))
+    options.precision = options.precision or (["fp32"] if on_cpu else ["fp32", "fp16", "bf16"])
 
     # The memory of our side alone, before PyTorch is loaded.
     task, largest = options.tasks[0], max(options.sizes)
     description, n_in, n_out = TASKS[task]
-    model = nn.Model.from_config(description, n_in, n_out, threads=options.threads)
+    model = nn.Model.from_config(description, n_in, n_out, device=device, threads=options.threads)
     model.train_step(np.zeros((1 << largest, n_in), np.float32), np.zeros((1 << largest, n_out), np.float32))
-    memory = peak_memory_bytes()
+    memory = peak_memory_bytes() if on_cpu else wp.get_mempool_used_mem_high(device)
     del model
     try:
         import torch
@@ -178,34 +223,44 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     torch.set_num_threads(options.threads)
 
+    name = "cpu" if on_cpu else device.alias
+    rates = {precision: gemm_rate(torch, name, precision) for precision in options.precision}
     report = {
-        "machine": machine(),
-        "threads": options.threads,
-        "gemm_flops": gemm_rate(torch),
+        "machine": {**machine(), "device": device.name},
+        "threads": options.threads if on_cpu else None,
+        "gemm_flops": rates,
         "peak_memory_of_training_bytes": {"task": task, "batch": 1 << largest, "bytes": memory},
         "results": [],
+        "missing": {},
     }
-    table = Table(title=f"{options.threads} threads, float32; GEMM {report['gemm_flops'] / 1e9:.0f} GFLOP/s")
-    for heading in ("task", "batch", "mode", "engine", "M samples/s", "ours / it", "GFLOP/s", "of GEMM", "error"):
-        table.add_column(heading, justify="left" if heading in ("task", "mode", "engine") else "right")
-    for task in options.tasks:
-        for size in options.sizes:
-            results = Bench(task, 1 << size, options.threads, options.compile).run(options.rounds)
-            report["results"].append({"task": task, "batch": 1 << size, **results})
-            for mode, engines in results.items():
-                for engine, figure in engines.items():
-                    ratio = engines["ours"]["samples_per_second"] / figure["samples_per_second"]
-                    table.add_row(
-                        task, f"2^{size}", mode, engine,
-                        f"{figure['samples_per_second'] / 1e6:.3f}", "" if engine == "ours" else f"{ratio:.2f}",
-                        f"{figure['network_flops'] / 1e9:.1f}", f"{figure['network_flops'] / report['gemm_flops']:.2f}",
-                        f"{figure['relative_error']:.1e}",
-                    )  # fmt: skip
+    shown = ", ".join(f"{precision} {rate / 1e9:.0f}" for precision, rate in rates.items())
+    where = f"{options.threads} threads" if on_cpu else device.name
+    table = Table(title=f"{where}; GEMM in GFLOP/s: {shown}", box=box.SIMPLE)
+    for heading in ("task", "mode", "of", "engine"):
+        table.add_column(heading)
+    for heading in ("batch", "M samples/s", "ours / it", "GFLOP/s", "of GEMM", "error"):
+        table.add_column(heading, justify="right")
+    for task, size, precision in itertools.product(options.tasks, options.sizes, options.precision):
+        bench = Bench(task, 1 << size, precision, name, options.threads, not options.no_compile)
+        results = bench.run(options.rounds)
+        report["results"].append({"task": task, "batch": 1 << size, "precision": precision, **results})
+        report["missing"].update(bench.missing)
+        for mode, engines in results.items():
+            for engine, figure in engines.items():
+                ratio = engines["ours"]["samples_per_second"] / figure["samples_per_second"]
+                table.add_row(
+                    task, mode, precision, engine, f"2^{size}",
+                    f"{figure['samples_per_second'] / 1e6:.3f}", "" if engine == "ours" else f"{ratio:.2f}",
+                    f"{figure['network_flops'] / 1e9:.1f}", f"{figure['network_flops'] / rates[precision]:.2f}",
+                    f"{figure['relative_error']:.1e}",
+                )  # fmt: skip
     console.print(table)
     console.print(
-        f"load {report['machine']['load']}; peak memory of the process after a training step of {options.tasks[0]} "
-        f"with 2^{largest} samples, before PyTorch is loaded: {megabytes(memory)}"
+        f"load {report['machine']['load']}; peak memory {'of the process ' if on_cpu else ''}after a training step of "
+        f"{options.tasks[0]} with 2^{largest} samples, before PyTorch is loaded: {megabytes(memory)}"
     )
+    for engine, reason in report["missing"].items():
+        console.print(f"{engine}: not measured: {reason}")
     if options.json:
         with open(options.json, "w", encoding="utf-8") as stream:
             json.dump(report, stream, indent=1)

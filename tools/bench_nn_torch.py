@@ -127,11 +127,22 @@ class Network(torch.nn.Module):
                     at += tensor.numel()
 
 
-class Trainer:
-    """A training step with fused Adam over all parameters, and the average of the parameters."""
+AUTOCAST = {"fp16": torch.float16, "bf16": torch.bfloat16}
 
-    def __init__(self, network: Network, cfg: c.ModelConfig, compiled: bool):
-        self.network = network
+
+class Trainer:
+    """A training step with fused Adam over all parameters, and the average of the parameters.
+
+    Args:
+        network: The network, on its device.
+        cfg: Its configuration.
+        compiled: By `torch.compile`.
+        precision: Of matrix products: ``fp32``, ``tf32`` (on CUDA), or ``fp16`` and ``bf16`` by autocast.
+    """
+
+    def __init__(self, network: Network, cfg: c.ModelConfig, compiled: bool, precision: str = "fp32"):
+        self.network, self.precision = network, precision
+        self.device_type = next(network.parameters()).device.type
         optimizer, self.decay = cfg.optimizer, None
         if isinstance(optimizer, c.EMA):
             optimizer, self.decay = optimizer.nested, optimizer.decay
@@ -143,7 +154,14 @@ class Trainer:
             fused=True,
         )
         self.averages = [p.detach().clone() for p in network.parameters()]
-        self.call = torch.compile(network) if compiled else network
+        self.module = torch.compile(network, dynamic=False) if compiled else network
+
+    def call(self, x):
+        torch.backends.cuda.matmul.allow_tf32 = self.precision == "tf32"
+        if self.precision not in AUTOCAST:
+            return self.module(x)
+        with torch.autocast(self.device_type, AUTOCAST[self.precision]):
+            return self.module(x).float()
 
     def train(self, x, target):
         self.optimizer.zero_grad(set_to_none=True)

@@ -72,14 +72,15 @@ class _FixedPart(_Part):
 class _GridPart(_Part):
     """A grid; `offset` is that of its first parameter among those of the model."""
 
-    def __init__(self, cfg, n_dims, first_dim, column, layout, device):
+    def __init__(self, cfg, n_dims, first_dim, column, layout, device, blocks):
         super().__init__(cfg, n_dims, first_dim, column, cfg.n_levels * cfg.n_features_per_level)
         self.layout, self.offset = layout, 0
         self.n_params = layout.n_entries * cfg.n_features_per_level
         self.levels = layout.upload(device)
         kind = (n_dims, cfg.n_features_per_level, cfg.interpolation, any(layout.hashed))
-        self._cpu = device.is_cpu
-        self._kernels = make_cpu_grid_kernels(*kind) if self._cpu else make_grid_kernels(*kind)
+        self._blocks = blocks
+        self._kernels = make_cpu_grid_kernels(*kind) if blocks else make_grid_kernels(*kind)
+        self._sums = None
         self._feature = wp.types.vector(cfg.n_features_per_level, wp.float32)
 
     def kernels(self):
@@ -98,7 +99,7 @@ class _GridPart(_Part):
     def forward(self, x, first_row, n_rows, first_dim, parameters, encoded, column):
         """Writes features of rows ``first_row … first_row + n_rows``."""
         inputs = [first_dim, self.levels, self._view(parameters)]
-        if self._cpu:
+        if self._blocks:
             dim, inputs = (-(-n_rows // 64), self.cfg.n_levels), [x, first_row, first_row + n_rows, *inputs]
         else:
             dim, inputs = (self.cfg.n_levels, n_rows), [x, first_row, *inputs]
@@ -107,11 +108,12 @@ class _GridPart(_Part):
     def backward_parameters(self, x, n_rows, dL_dencoded, gradients, workers):
         """Adds the gradient with respect to the parameters, over all rows.
 
-        On the CPU device a thread takes whole levels and goes through the rows in order: no copies, no atomics, and the
-        same sums for any number of threads.
+        In blocks a thread takes whole levels and goes through the rows in order: no copies, no atomics, and the same
+        sums for any number of threads. Elsewhere atomics add in float64: in float32 the rounding of a million equal
+        terms would be seen, and sums would depend on timing by more than a rounding.
         """
         view = self._view(gradients)
-        if self._cpu:
+        if self._blocks:
             workers.run(
                 lambda first, n, worker: wp.launch(
                     self._kernels[1],
@@ -123,16 +125,22 @@ class _GridPart(_Part):
                 self.cfg.n_levels,
             )
             return
+        if self._sums is None:
+            self._sums = wp.zeros(self.n_params, dtype=wp.float64, device=x.device)
         inputs = [x, self.first_dim, self.levels, dL_dencoded, self.column]
-        wp.launch(self._kernels[1], dim=(self.cfg.n_levels, n_rows), inputs=inputs, outputs=[view], device=x.device)
+        wp.launch(
+            self._kernels[1], dim=(self.cfg.n_levels, n_rows), inputs=inputs, outputs=[self._sums], device=x.device
+        )
+        inputs, outputs = [self.offset], [self._sums, gradients]
+        wp.launch(k.add_sums, dim=self.n_params, inputs=inputs, outputs=outputs, device=x.device)
 
     def backward_inputs(self, x, first_row, n_rows, parameters, dL_dencoded, dL_dx):
         """Adds the gradient with respect to the inputs of these rows."""
-        rows = [first_row, first_row + n_rows] if self._cpu else [first_row]
+        rows = [first_row, first_row + n_rows] if self._blocks else [first_row]
         inputs = [x, *rows, self.first_dim, self.levels, self.cfg.n_levels, self._view(parameters)]
         wp.launch(
             self._kernels[2],
-            dim=-(-n_rows // 64) if self._cpu else n_rows,
+            dim=-(-n_rows // 64) if self._blocks else n_rows,
             inputs=[*inputs, dL_dencoded, self.column],
             outputs=[dL_dx],
             device=x.device,
@@ -144,9 +152,9 @@ def _factors_on(device: str):
     return wp.array(spherical_harmonics_factors().astype(np.float32), dtype=wp.float32, device=device)
 
 
-def _make_part(cfg, n_dims, first_dim, column, path, device):
+def _make_part(cfg, n_dims, first_dim, column, path, device, blocks):
     if isinstance(cfg, c.Grid):
-        return _GridPart(cfg, n_dims, first_dim, column, GridLayout(cfg, n_dims, path), device)
+        return _GridPart(cfg, n_dims, first_dim, column, GridLayout(cfg, n_dims, path), device, blocks)
     if isinstance(cfg, c.SphericalHarmonics):
         if n_dims != 3:
             raise ConfigError(f"{path}.n_dims_to_encode", f"found {n_dims}; spherical harmonics encode 3 dimensions")
@@ -174,12 +182,13 @@ class Encoding:
         cfg: The encoding.
         n_dims: Input dimensions.
         device: Where it runs.
+        blocks: By the kernels of the CPU device for blocks of rows, where it has its own.
 
     Raises:
         ConfigError: The parts do not fit the input dimensions.
     """
 
-    def __init__(self, cfg: c.Encoding, n_dims: int, device):
+    def __init__(self, cfg: c.Encoding, n_dims: int, device, blocks: bool):
         self.parts = []
         composite = isinstance(cfg, c.Composite)
         dim = column = 0
@@ -200,7 +209,7 @@ class Encoding:
             size = rest if part.n_dims_to_encode is None else part.n_dims_to_encode
             if size == 0:
                 raise ConfigError(f"{path}.n_dims_to_encode", "found 0; no input dimension is left for this part")
-            self.parts.append(_make_part(part, size, dim, column, path, device))
+            self.parts.append(_make_part(part, size, dim, column, path, device, blocks))
             dim, column = dim + size, column + self.parts[-1].n_features
         self.n_dims, self.n_features, self.stride = n_dims, column, pad(column)
         self.n_params = sum(part.n_params for part in self.parts)

@@ -141,11 +141,11 @@ def make_grid_kernels(n_dims: int, n_features: int, interpolation: str, hashed: 
                 if place.hashed:
                     factor = wp.uint32(1)
                     if d == 1:
-                        factor = wp.uint32(2654435761)
+                        factor = wp.static(wp.uint32(2654435761))
                     if d == 2:
-                        factor = wp.uint32(805459861)
+                        factor = wp.static(wp.uint32(805459861))
                     if d == 3:
-                        factor = wp.uint32(3674653429)
+                        factor = wp.static(wp.uint32(3674653429))
             place.low[d] = cell * factor
             place.high[d] = (cell + wp.uint32(1)) * factor
         return place
@@ -227,7 +227,7 @@ def make_grid_kernels(n_dims: int, n_features: int, interpolation: str, hashed: 
         dL_dencoded: wp.array2d[wp.float32],
         column: int,
         # out
-        dL_dfeatures: wp.array[Feature],
+        sums: wp.array[wp.float64],
     ):
         level, row = wp.tid()
         place = find_place(levels, level, x, row, first_dim)
@@ -237,7 +237,9 @@ def make_grid_kernels(n_dims: int, n_features: int, interpolation: str, hashed: 
             w = wp.float32(1.0)
             if wp.static(corners > 1):
                 w = weight(t, corner)
-            wp.atomic_add(dL_dfeatures, entry(place, corner), w * g)
+            first = entry(place, corner) * wp.static(n_features)
+            for f in range(wp.static(n_features)):
+                wp.atomic_add(sums, first + f, wp.float64(w * g[f]))
 
     @kernel
     def backward_inputs(

@@ -345,11 +345,14 @@ def gather_columns(
     encoded: wp.array2d[wp.float32],
     column: int,
 ):
-    """Copies row ``index[row]`` of a latent that was encoded before."""
+    """Copies row ``index[row]`` of a latent that was encoded before; NaN if there is no such row."""
     row = first_row + wp.tid()
     source = index[row]
     for c in range(n_columns):
-        encoded[row, column + c] = latent[source, c]
+        value = wp.float32(wp.nan)
+        if source >= 0 and source < latent.shape[0]:
+            value = latent[source, c]
+        encoded[row, column + c] = value
 
 
 @wp.kernel
@@ -358,3 +361,12 @@ def count_nonfinite_rows(
 ):
     if has_nonfinite(x, first_row + wp.tid(), n_dims) != 0:
         wp.atomic_add(counter, slot, 1)
+
+
+@wp.kernel
+def add_sums(first: int, sums: wp.array[wp.float64], gradients: wp.array[wp.float32]):
+    """Adds sums to the gradients from index `first`, and clears them."""
+    i = wp.tid()
+    if sums[i] != wp.float64(0.0):
+        gradients[first + i] = gradients[first + i] + wp.float32(sums[i])
+        sums[i] = wp.float64(0.0)

@@ -30,7 +30,7 @@ NPM = {
 }  # fmt: skip
 
 
-def make(encoding=None, network=None, n_in=3, n_out=4, seed=1, threads=1, spread=0.5, **rest):
+def make(encoding=None, network=None, n_in=3, n_out=4, seed=1, threads=1, spread=0.5, execution=None, **rest):
     """A model whose parameters are all random and of a size that matters."""
     network = (
         {"otype": "MLP", "n_neurons": 16, "n_hidden_layers": 1, **(network or {})}
@@ -38,7 +38,7 @@ def make(encoding=None, network=None, n_in=3, n_out=4, seed=1, threads=1, spread
         else network
     )
     config = {"encoding": encoding or {"otype": "Identity"}, "network": network, **rest}
-    model = nn.Model.from_config(config, n_in, n_out, seed=seed, threads=threads)
+    model = nn.Model.from_config(config, n_in, n_out, seed=seed, threads=threads, execution=execution)
     rng = np.random.default_rng(seed + 100)
     values = model.parameters.numpy()
     values[model.n_matrix_params :] = rng.uniform(-spread, spread, len(values) - model.n_matrix_params)

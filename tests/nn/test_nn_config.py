@@ -99,7 +99,7 @@ WRONG = [
     (["optimizer", "nested", "otype"], "Shampoo", r"found \"Shampoo\"; allowed: Adam, SGD, EMA, ExponentialDecay"),
     (["gradient_clipping"], {"norm": 1}, r"^gradient_clipping\.norm: unknown key.*; allowed: global_norm"),
     (["loss_scale"], "static", r'^loss_scale: found "static"; allowed: a number > 0 or "dynamic"'),
-    (["precision"], "fp16", r'^precision: found "fp16"; allowed on the CPU device: "fp32"'),
+    (["precision"], "fp64", r'^precision: found "fp64"; allowed: "fp32", "fp16", "bf16"'),
     (["encoding", "nested", 1, "n_dims_to_encode"], 4, r"^encoding\.nested\[1\]\.n_dims_to_encode: found 4; spherical"),
     (["encoding", "nested", 2, "n_dims_to_encode"], 2, r"^encoding: its parts encode 8 dimensions; the model has 9"),
     (["encoding", "nested", 2, "n_dims_to_encode"], 7, r"^encoding: its parts encode 13 dimensions; the model has 9"),
