@@ -135,3 +135,11 @@ def walk(record: description.Record, path: str = "") -> Iterator[tuple[str, desc
         else:
             children = [(f"{path}[{i}]", child) for i, child in enumerate(item)]
         stack.extend(child for child in reversed(children) if isinstance(child[1], (description.Record, list)))
+
+
+def value_at(scene: description.Scene, key: str) -> object:
+    """A setting of a scene by the key of its override, such as ``integrator.max_depth`` or ``film.filter.type``."""
+    value = scene
+    for step in key.split("."):
+        value = value.__struct_config__.tag if step == "type" else getattr(value, step)
+    return value
