@@ -94,6 +94,7 @@ def test_contract(tmp_path_factory, described, n_out, n):
     other.load(file)
     np.testing.assert_array_equal(other.inference(x), one.inference(x))
     np.testing.assert_equal(other.train_step(x, target), one.train_step(x, target))
+    np.testing.assert_array_equal(other.parameters.numpy(), one.parameters.numpy())
 
     if n and cfg.precision == "fp32" and np.isfinite(before).all():
         fresh = nn.Model.from_config(cfg, dims, n_out, seed=5)
