@@ -138,7 +138,10 @@ class Model:
             ConfigError: With the path in the configuration, what was found, and what is allowed.
         """
         cfg = c.load(cfg)
-        device = wp.get_device(device)
+        try:
+            device = wp.get_device(device)
+        except (RuntimeError, ValueError) as error:
+            raise NnError(f"device: found {device!r}; {error}") from None
         allowed = ("blocks", "tiles") if device.is_cpu else ("tiles",)
         execution = allowed[0] if execution is None else execution
         if execution not in allowed:
