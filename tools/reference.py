@@ -321,7 +321,7 @@ def make_reference(
         reached=None if goal.error is None else error <= goal.error,
         details=maker.details(),
         machine=machine(),
-        date=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        date=datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
     )
     with replacing(_account_path(path)) as temporary:
         temporary.write_bytes(msgspec.json.format(msgspec.json.encode(account), indent=2) + b"\n")

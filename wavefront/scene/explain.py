@@ -166,7 +166,7 @@ def _nearest(word, words):
 def _allows(types, value):
     """Whether a container is of a right kind, so that something inside it must be the trouble."""
     if isinstance(value, dict):
-        return any(isinstance(t, inspect.StructType) for t in types)
+        return any(isinstance(t, (inspect.StructType, inspect.DictType)) for t in types)
     for kind in types:
         if isinstance(kind, inspect.TupleType) and len(value) == len(kind.item_types):
             return True
@@ -190,6 +190,8 @@ def _singular(kind):
         return "an integer" + _range(kind)
     if isinstance(kind, inspect.FloatType):
         return "a number" + _range(kind)
+    if isinstance(kind, inspect.DictType):
+        return "an object"
     return "a list of " + _plural(kind)
 
 
