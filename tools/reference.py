@@ -278,6 +278,11 @@ def make_reference(
     if renderer not in MAKERS:
         raise WavefrontError(f"unknown renderer {renderer!r} of references; allowed: {', '.join(MAKERS)}")
     RENDERERS[renderer].check(job)
+    if getattr(job.scene.integrator, "sampler", "independent") != "independent":
+        raise WavefrontError(
+            f"integrator.sampler is {job.scene.integrator.sampler!r}; references take independent samples, whose variance "
+            "is known"
+        )
     target = target_records(job.scene)
     path = reference_path(folder, scene_name(job.path), scene_hash(target), renderer)
     settings = _plain(
