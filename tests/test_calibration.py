@@ -36,9 +36,7 @@ def coverage(job, spp: int, seed: int, reference, variance) -> tuple[float, floa
         image, spread = estimate(job, seed + i, spp)
         difference, total = image - reference, spread + variance
         of_pixels.append(np.abs(difference) <= NORMAL * np.sqrt(total))
-        of_tiles.append(
-            np.abs(tile_sums(difference, tiles) / area) <= NORMAL * np.sqrt(tile_sums(total, tiles)) / area
-        )
+        of_tiles.append(np.abs(tile_sums(difference, tiles) / area) <= NORMAL * np.sqrt(tile_sums(total, tiles)) / area)
     return float(np.mean(of_tiles)), float(np.mean(of_pixels))
 
 

@@ -264,12 +264,10 @@ class Run:
 
     def _reference(self, scene: PlannedScene) -> SceneEntry:
         """Makes or finds the references of a scene; the first renderer's is what errors are measured with."""
-        made = []
+        made, job, folder = [], scene.reference_job, self.references
         for renderer in scene.reference.renderers:
             self.console.print(f"{scene.name}: reference by {renderer}")
-            made.append(
-                make_reference(scene.reference_job, scene.goal, self.references, renderer, console=self.console)
-            )
+            made.append(make_reference(job, scene.goal, folder, renderer, console=self.console, exact=False))
         reference = self.images[scene.name] = made[0]
         comparisons = compare_stored(reference)
         for comparison in comparisons:
