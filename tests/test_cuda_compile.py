@@ -29,6 +29,7 @@ CORNELL_BOX = Features(
     light_textures=(),
     nee=True,
     roulette=True,
+    sampler="independent",
     camera="perspective",
     filter="box",
     aovs=(),
@@ -50,6 +51,7 @@ EVERYTHING = Features(
     light_textures=("bytes", "checkerboard", "floats", "halves", "shorts"),
     nee=True,
     roulette=True,
+    sampler="independent",
     camera="perspective",
     filter="gaussian",
     aovs=FIRST_HIT,
@@ -71,7 +73,7 @@ CHANGES = [
     {"bsdfs": ("conductor",), "roulette": False, "filter": "box"},
     {"bsdfs": ("principled",)},
     {"bsdfs": ("dielectric",), "aovs": ("albedo",), "variance": False},
-    {"camera": "thin_lens"},
+    {"camera": "thin_lens", "sampler": "sobol"},
     {"camera": "orthographic", "aovs": ("shape_index",)},
 ]
 
@@ -85,7 +87,7 @@ def compile_inspectors(f: Features, arch: int, folder) -> int:
     """The same for the kernels of a traced path."""
     kernels = [make_inspect_hit(f.triangles, f.spheres, f.instances)]
     if f.light_sampling:
-        kernels.append(make_inspect_light(f.lights, f.light_textures))
+        kernels.append(make_inspect_light(f.lights, f.light_textures, f.sampler))
     return compile_modules([kernel.module for kernel in kernels], arch, folder)
 
 

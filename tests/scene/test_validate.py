@@ -368,6 +368,14 @@ def test_legal_scenes_pass(scene):
     validate(scene)
 
 
+@pytest.mark.parametrize(("sampler", "aovs"), [("independent", ["variance"]), ("sobol", ["depth"]), ("sobol", ["variance"])])
+def test_a_variance_of_samples_that_are_not_independent_is_a_warning(sampler, aovs):
+    film, integrator = d.Film(aovs=aovs), d.PathIntegrator(sampler=sampler)
+    warnings = validate(d.Scene(shapes=[d.Cube()], emitters=[d.Constant()], film=film, integrator=integrator))
+    assert len(warnings) == (sampler == "sobol" and "variance" in aovs)
+    assert all("film.aovs: variance is that of independent samples" in warning for warning in warnings)
+
+
 def test_warnings_are_returned_and_passed_on():
     told = []
     assert (
