@@ -133,8 +133,8 @@ def test_shuffling_keeps_blocks(shift, factor):
 
 def test_digits_are_flipped_at_random():
     """Owen's scrambling flips each digit by a bit that belongs to the digits before it. Of 8 numbers that differ in the
-    first three digits, over random keys: every pair of such bits is equally often equal and not, and so is a bit with
-    itself at other keys; false-alarm rate 1e-4."""
+    first three digits, over random keys: every such bit is set as often as not, and every two are equal as often as not;
+    false-alarm rate 1e-4."""
     rng = np.random.default_rng(3)
     prefixes = np.arange(8)
     flips = []
@@ -144,7 +144,8 @@ def test_digits_are_flipped_at_random():
         flips.append([x[0] & 1, *((x[i] >> 1) & 1 for i in range(2)), *((x[i] >> 2) & 1 for i in range(4))])
     flips = np.array(flips)
     n, nodes = flips.shape
-    counts = [flips[:, a].sum() if a == b else (flips[:, a] ^ flips[:, b]).sum() for a in range(nodes) for b in range(a + 1)]
+    pairs = [(a, b) for a in range(nodes) for b in range(a)]
+    counts = [*flips.sum(axis=0), *((flips[:, a] ^ flips[:, b]).sum() for a, b in pairs)]
     level = sidak(len(counts))
     for count in counts:
         assert stats.binomtest(int(count), n, 0.5).pvalue > level
@@ -154,7 +155,7 @@ def test_digits_are_flipped_at_random():
 
 
 def assert_net(x, t=0):
-    """A (t,m,s)-net in base 2 (Niederreiter 1992): every elementary interval of volume 2^(t-m) has 2^t of 2^m points."""
+    """A (t,m,s)-net in base 2 (Niederreiter 1992): an elementary interval of volume 2^(t-m) has 2^t of the 2^m points."""
     n, s = x.shape
     m = int(math.log2(n))
     for shape in np.ndindex(*[m - t + 1] * s):
@@ -200,7 +201,7 @@ def test_far_samples_are_stratified():
     ("name", "index"),
     [
         ("pixels", grid(pixels=1 << 16)),
-        ("pixels, a later sample", grid(pixels=1 << 16) + [0, 77, 0, 0]),
+        ("pixels, a later sample", grid(pixels=1 << 16) + np.array([0, 77, 0, 0])),
         ("pixels and samples", grid(pixels=1 << 15, samples=3)),
         ("bounces", grid(pixels=1 << 10, bounces=64)),
         ("purposes", grid(pixels=1 << 14, purposes=PURPOSES)),
@@ -229,14 +230,14 @@ def pair_p_value(a, b) -> float:
 
 def test_decisions_are_independent():
     """Pairs of numbers of the same sample and of another one, from decisions that differ in one word of their key, over
-    pixels. Shuffled alike, sequences would pass within a sample and fail between two: so the places of two samples in two
+    pixels. Sequences that are scrambled apart but shuffled alike pass that: so the distances of two samples in two
     decisions are tested together too."""
     n = 1 << 16
-    first = grid(pixels=n) + [0, 5, 0, PURPOSE_LIGHT]
+    first = grid(pixels=n) + np.array([0, 5, 0, PURPOSE_LIGHT])
     others = {"seed": (first, 1), "high seed": (first, 1 << 32)}
     for column, name in ((0, "pixel"), (2, "bounce"), (3, "purpose")):
         others[name] = (first + np.eye(4, dtype=int)[column], 0)
-    later = [0, 8, 0, 0]  # sample 13: in no small block with sample 5
+    later = np.array([0, 8, 0, 0])  # sample 13: in no small block with sample 5
     u, v = draw(first), draw(first + later)
     cases = {}
     for name, (index, seed) in others.items():
@@ -257,9 +258,9 @@ def test_decisions_are_independent():
 def test_decisions_are_shuffled_apart():
     """How many of 64 samples are below 1/q in two decisions: chi-square over pixels, false-alarm rate 1e-4.
 
-    Of every q samples from a multiple of q on, one is below 1/q in each. Its place among them is random and independent,
-    so the number is binomial, of 64/q trials with the probability 1/q. Sequences that are scrambled but not shuffled
-    would have it 0 or 64/q.
+    Of every q samples from a multiple of q on, one is below 1/q in each. Its place among them is random and
+    independent, so the number is binomial, of 64/q trials with the probability 1/q. Sequences that are scrambled but
+    not shuffled would have it 0 or 64/q.
     """
     pixels, n = 4000, 64
     index = grid(pixels=pixels, samples=n)
@@ -270,8 +271,8 @@ def test_decisions_are_shuffled_apart():
         for q in (2, 4, 8):
             for i in range(4):
                 both = ((a[:, :, i] < 1.0 / q) & (b[:, :, 3 - i] < 1.0 / q)).sum(axis=1)
-                counts = np.bincount(both, minlength=n // q + 1)
-                cases[name, q, i] = p_value(np.append(counts, 0), stats.binom(n // q, 1.0 / q).pmf(np.arange(n // q + 1)))
+                expected = stats.binom(n // q, 1.0 / q).pmf(np.arange(n // q + 1))
+                cases[name, q, i] = p_value(np.bincount(both, minlength=n // q + 2), expected)
     level = sidak(len(cases))
     for case, p in cases.items():
         assert p > level, case

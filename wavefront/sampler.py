@@ -3,10 +3,11 @@
 ``independent`` is Philox. ``sobol`` is a Sobol sequence of four dimensions with Owen's scrambling (Owen 1995, "Randomly
 Permuted (t,m,s)-Nets and (t,s)-Sequences"), both scrambled and shuffled by hashing (Laine and Karras 2011; Burley 2020,
 "Practical Hash-based Owen Scrambling"). It is padded: every pixel, bounce and purpose has a sequence of its own, in
-which a sample is the point of its index. No two decisions share a dimension, and shuffling pairs their points at random.
-So a decision is well distributed over the samples of a pixel, whatever the others are, and it is best after a power of
-two. Both samplers are functions of (seed, pixel, sample, bounce, purpose) alone, and under both each number is uniform;
-only under the first are the samples of a pixel independent. Another seed is an independent randomisation.
+which a sample is the point of its index. No two decisions share a dimension, and shuffling pairs their points at
+random. So each decision alone is well distributed over the samples of a pixel, best where they are a power of two.
+
+Both samplers are functions of (seed, pixel, sample, bounce, purpose) alone, and under both each number is uniform; only
+under the first are the samples of a pixel independent. Another seed is an independent randomisation.
 
 Dimensions of the sequence that a decision uses, by the component of the result:
 
@@ -73,8 +74,8 @@ def sobol_digits(index: wp.uint32) -> wp.vec4ui:
     """The point of an index in four dimensions of Sobol's sequence; bit k is the digit of weight 2^-(k+1).
 
     The primitive polynomials are x (van der Corput's sequence), x + 1, x^2 + x + 1 and x^3 + x + 1, and the first
-    direction numbers those of Joe and Kuo 2008. Direction numbers follow by their recurrence, which in this order of bits
-    shifts to the left.
+    direction numbers those of Joe and Kuo 2008. The others follow by recurrence, which in this order of bits shifts to the
+    left.
     """
     x1 = wp.uint32(0)
     x2 = wp.uint32(0)

@@ -411,7 +411,8 @@ def test_integrators(load_xml, body, expected, warning):
     ],
 )
 def test_samplers(load_xml, kind, sampler, warns):
-    plugin = f'<sampler type="{kind}"><integer name="sample_count" value="9"/><integer name="seed" value="1"/></sampler>'
+    numbers = '<integer name="sample_count" value="9"/><integer name="seed" value="1"/>'
+    plugin = f'<sampler type="{kind}">{numbers}</sampler>'
     path = '<integrator type="path"><integer name="max_depth" value="7"/></integrator>'
     integrator = load_xml(f'{path}<sensor type="perspective">{plugin}</sensor>', sensor=False).integrator
     assert integrator == d.PathIntegrator(max_depth=7, sampler=sampler, spp=9)

@@ -693,8 +693,8 @@ class PathIntegrator(Record, tag_field="type", tag="path"):
     sampler: Annotated[
         Literal["independent", "sobol"],
         Meta(
-            description="Random numbers: independent, or an Owen-scrambled Sobol sequence, with less noise for the same "
-            "number of samples, of which powers of two are best."
+            description="Random numbers: independent, or Owen-scrambled Sobol points, with less noise for the same "
+            "number of samples; powers of two are best."
         ),
     ] = "independent"
     spp: Annotated[int, Meta(ge=1, le=2**31 - 1, description="Samples per pixel.")] = 64
