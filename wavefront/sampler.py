@@ -74,8 +74,8 @@ def sobol_digits(index: wp.uint32) -> wp.vec4ui:
     """The point of an index in four dimensions of Sobol's sequence; bit k is the digit of weight 2^-(k+1).
 
     The primitive polynomials are x (van der Corput's sequence), x + 1, x^2 + x + 1 and x^3 + x + 1, and the first
-    direction numbers those of Joe and Kuo 2008. The others follow by recurrence, which in this order of bits shifts to the
-    left.
+    direction numbers those of Joe and Kuo 2008. The others follow by recurrence, which shifts to the left in this order
+    of bits.
     """
     x1 = wp.uint32(0)
     x2 = wp.uint32(0)
