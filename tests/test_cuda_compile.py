@@ -109,6 +109,13 @@ def test_kernels_of_a_traced_path_compile_for_cuda(tmp_path):
     assert len([path for path in tmp_path.iterdir() if path.suffix in (".ptx", ".cubin")]) == 2
 
 
+def test_kernels_that_draw_sobol_points_compile_for_cuda(tmp_path):
+    kernels = make_kernels(dataclasses.replace(CORNELL_BOX, sampler="sobol"))
+    modules = [kernel.module for kernel in (kernels.generate, kernels.direct, kernels.scatter)]
+    assert compile_modules(modules, 90, tmp_path) == 3
+    assert len([path for path in tmp_path.iterdir() if path.suffix in (".ptx", ".cubin")]) == 3
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("arch", [80, 90])
 @pytest.mark.parametrize("change", range(len(CHANGES)))
