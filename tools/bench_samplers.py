@@ -3,7 +3,7 @@
 Every sampler renders a scene with several seeds, alternating with the others in one process. The error is the standard
 deviation of a pixel between seeds, the root of its mean square over pixels and channels, relative to the mean radiance;
 it needs no reference. The order is the slope of log error over log samples, -0.5 for independent samples. The cost is
-the time of a sample relative to an independent one, as the median over pairs of renders.
+the processor time of a sample relative to an independent one, as the median over pairs of renders.
 """
 
 from __future__ import annotations
@@ -21,8 +21,10 @@ from rich.table import Table
 from tools.bench_common import ROOT, machine, show, spread
 from wavefront import Renderer, load_scene
 from wavefront.errors import WavefrontError
+from wavefront.output import check_writable
 from wavefront.render import parse_size
 from wavefront.sampler import SAMPLERS
+from wavefront.scene.images import replacing
 
 BASELINE = "independent"
 ORDER_FROM = 4  # samples per pixel from which the slope is fitted
@@ -54,16 +56,16 @@ def measure(path: Path, arguments: argparse.Namespace, progress) -> dict:
     scenes = {name: load_scene(path, [*overrides, f"integrator.sampler={name}"]) for name in SAMPLERS}
     counts = sample_counts(arguments.spp)
     images = {name: [] for name in SAMPLERS}  # [seeds][counts] of [h, w, 3]
-    seconds = {name: [] for name in SAMPLERS}  # of a sample, after the first ones
+    seconds = {name: [] for name in SAMPLERS}  # of all threads, for a sample after the first ones
     for seed in range(arguments.seeds):
         names = list(SAMPLERS) if seed % 2 == 0 else list(SAMPLERS)[::-1]
         for name in names:
             renderer = Renderer(scenes[name], threads=arguments.threads, seed=seed)
             renderer.render(counts[0])
-            stack, begin = [renderer.film.image().astype(np.float64)], time.perf_counter()
+            stack, begin = [renderer.film.image().astype(np.float64)], time.process_time()
             for n in counts[1:]:
                 stack.append(renderer.render(n - renderer.sample_count).astype(np.float64))
-            seconds[name].append((time.perf_counter() - begin) / max(counts[-1] - counts[0], 1))
+            seconds[name].append((time.process_time() - begin) / (counts[-1] - counts[0]))
             images[name].append(stack)
         progress(f"{path.stem}: seed {seed + 1} of {arguments.seeds}")
     mean = float(np.mean([stack[-1] for stack in images[BASELINE]]))
@@ -106,7 +108,7 @@ def build_parser() -> argparse.ArgumentParser:
         prog="python -m tools.bench_samplers", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("scenes", nargs="*", type=Path, metavar="SCENE", help="default: cornell-box and door-ajar")
-    parser.add_argument("--spp", type=int, default=1024, metavar="N", help="most samples per pixel; default 1024")
+    parser.add_argument("--spp", type=int, default=256, metavar="N", help="most samples per pixel; default 256")
     parser.add_argument("--seeds", type=int, default=8, metavar="N", help="renders of each sampler; default 8")
     parser.add_argument("--size", type=parse_size, default="64x64", metavar="WxH", help="default 64x64")
     parser.add_argument("--threads", type=int, metavar="N", help="default: all cores")
@@ -125,8 +127,10 @@ def run(arguments: argparse.Namespace) -> int:
     """
     if arguments.seeds < 2:
         raise WavefrontError(f"--seeds {arguments.seeds}; allowed: 2 or more, between which the error is measured")
-    if arguments.spp < 1:
-        raise WavefrontError(f"--spp {arguments.spp}; allowed: 1 or more")
+    if arguments.spp < 2:
+        raise WavefrontError(f"--spp {arguments.spp}; allowed: 2 or more")
+    if arguments.json:
+        check_writable(arguments.json)
     begin = time.perf_counter()
 
     def progress(message: str) -> None:
@@ -138,7 +142,8 @@ def run(arguments: argparse.Namespace) -> int:
     for scene in account["scenes"]:
         console.print(scene_table(scene))
     if arguments.json:
-        arguments.json.write_text(json.dumps(account, indent=2) + "\n", encoding="utf-8")
+        with replacing(arguments.json) as temporary:
+            temporary.write_text(json.dumps(account, indent=2) + "\n", encoding="utf-8")
     return 0
 
 
