@@ -100,7 +100,7 @@ def _find_warnings(scene):
             )
     if "variance" in scene.film.aovs and scene.integrator.sampler != "independent":
         warnings.append(
-            f"film.aovs: variance is that of independent samples; those of integrator.sampler "
+            "film.aovs: variance is that of independent samples; those of integrator.sampler "
             f"{shown(scene.integrator.sampler)} are not, and have less as a rule"
         )
     for kind in ("textures", "bsdfs", "media"):
