@@ -9,7 +9,12 @@ import warp as wp
 
 from nn.errors import NnError
 
-Array = np.ndarray | wp.array
+Array = np.ndarray | wp.array  # or a tensor of PyTorch, which is not needed for the other two
+
+
+def is_tensor(array: object) -> bool:
+    """Whether it is a tensor of PyTorch."""
+    return hasattr(array, "__torch_function__")
 
 
 def as_input(array: Array, width: int, name: str, device) -> wp.array:
@@ -21,12 +26,15 @@ def as_input(array: Array, width: int, name: str, device) -> wp.array:
     shape = tuple(getattr(array, "shape", ()))
     if len(shape) != 2 or shape[1] != width:
         raise NnError(f"{name}: found shape {shape}; allowed: [n, {width}]")
+    if is_tensor(array) and str(array.dtype) == "torch.float32":
+        array = wp.from_torch(array.detach().contiguous(), requires_grad=False)
     if isinstance(array, wp.array):
         if array.dtype != wp.float32 or array.device != device:
             raise NnError(f"{name}: found {array.dtype.__name__} on {array.device}; allowed: float32 on {device}")
         return array if array.is_contiguous else wp.clone(array)
     if not isinstance(array, np.ndarray):
-        raise NnError(f"{name}: found {type(array).__name__}; allowed: a NumPy or Warp array")
+        found = array.dtype if is_tensor(array) else type(array).__name__
+        raise NnError(f"{name}: found {found}; allowed: a NumPy or Warp array, or a tensor of float32")
     if array.dtype.kind not in "fiu":
         raise NnError(f"{name}: found {array.dtype}; allowed: float32")
     array = np.ascontiguousarray(array, np.float32)
@@ -42,12 +50,16 @@ def as_output(out: Array | None, n: int, width: int, like: Array, device) -> tup
         NnError: `out` cannot be written to in place.
     """
     if out is None:
-        if isinstance(like, wp.array):
+        if isinstance(like, wp.array) or is_tensor(like):
             array = empty((n, width), device)
-            return array, lambda: array
+            return array, lambda: as_kind_of(like, array)
         out = np.empty((n, width), np.float32)
     if tuple(out.shape) != (n, width):
         raise NnError(f"out: found shape {tuple(out.shape)}; allowed: {(n, width)}")
+    if is_tensor(out):
+        if str(out.dtype) != "torch.float32" or not out.is_contiguous() or out.requires_grad:
+            raise NnError("out: allowed: a contiguous tensor of float32 without gradient")
+        return wp.from_torch(out, requires_grad=False), lambda: out
     if isinstance(out, wp.array):
         if out.dtype != wp.float32 or not out.is_contiguous or out.device != device:
             raise NnError(f"out: allowed: a contiguous float32 array on {device}")
@@ -67,13 +79,22 @@ def as_output(out: Array | None, n: int, width: int, like: Array, device) -> tup
     return array, finish
 
 
+def as_kind_of(like: Array, array: wp.array) -> Array:
+    """`array` as NumPy, Warp or PyTorch has it, whichever `like` is of."""
+    if is_tensor(like):
+        return wp.to_torch(array)
+    return array if isinstance(like, wp.array) else array.numpy()
+
+
 def as_index(index: Array, n: int, most: int, name: str, device) -> wp.array:
     """`n` row numbers below `most`, as int32. Those on a GPU are not read back: kernels leave NaN for wrong ones.
 
     Raises:
         NnError: Its length, type or a number is not allowed.
     """
-    checked = device.is_cpu or not isinstance(index, wp.array)
+    checked = device.is_cpu or isinstance(index, np.ndarray)
+    if is_tensor(index):
+        index = wp.from_torch(index.detach().contiguous()) if str(index.dtype) == "torch.int32" else index.cpu().numpy()
     if not isinstance(index, wp.array):
         index = wp.array(np.ascontiguousarray(index, np.int32), dtype=wp.int32, device=device)
     if index.shape != (n,) or index.dtype != wp.int32:

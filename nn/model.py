@@ -15,7 +15,7 @@ import warp as wp
 
 from nn import config as c
 from nn import optimizers
-from nn.arrays import Array, as_index, as_input, as_output, check_rows, empty
+from nn.arrays import Array, as_index, as_input, as_kind_of, as_output, check_rows, empty
 from nn.cpu_mlp import BLOCK, n_blocks
 from nn.cpu_network import CpuNetwork
 from nn.encodings import Encoding
@@ -138,7 +138,10 @@ class Model:
             ConfigError: With the path in the configuration, what was found, and what is allowed.
         """
         cfg = c.load(cfg)
-        device = wp.get_device(device)
+        try:
+            device = wp.get_device(device)
+        except (RuntimeError, ValueError) as error:
+            raise NnError(f"device: found {device!r}; {error}") from None
         allowed = ("blocks", "tiles") if device.is_cpu else ("tiles",)
         execution = allowed[0] if execution is None else execution
         if execution not in allowed:
@@ -175,7 +178,7 @@ class Model:
         """Evaluates a network; several threads may do so at once.
 
         Args:
-            x: Inputs, float32, ``[n, n_input_dims]``, NumPy or Warp. Contiguous arrays are not copied.
+            x: Inputs, float32, ``[n, n_input_dims]``, of NumPy, Warp or PyTorch. Contiguous arrays are not copied.
             out: Where to write; None: a new array of the kind of `x`.
             network: Which, if there are several.
             latents: Per index of a part, a result of `encode` and an int32 array of `n` row numbers of it: the part is
@@ -265,7 +268,7 @@ class Model:
         self._executions[network].load(None)
         nothing = empty((0, 0), self.device)
         _, dL_dx = self._differentiate(rows, flat, {network: net}, None, {network: (target, nothing)}, input_gradient)
-        return dL_dx if dL_dx is None or isinstance(dL_dy, wp.array) else dL_dx.numpy()
+        return None if dL_dx is None else as_kind_of(dL_dy, dL_dx)
 
     def compute_gradients(
         self,

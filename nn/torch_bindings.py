@@ -20,8 +20,7 @@ class Evaluate(torch.autograd.Function):
     def forward(ctx, x, parameters, model, network):
         ctx.model, ctx.network = model, network
         ctx.save_for_backward(x, parameters)
-        y = model.inference(_to_warp(x), network=network, averaged=False)
-        return wp.to_torch(y)
+        return model.inference(x.float(), network=network, averaged=False)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -31,12 +30,12 @@ class Evaluate(torch.autograd.Function):
         # The model's own sums are set aside, so that calls may be mixed with its own training.
         kept = wp.clone(model.gradients)
         model.zero_gradients()
-        model.forward(_to_warp(x), ctx.network)
-        dL_dx = model.backward(_to_warp(dL_dy), input_gradient=ctx.needs_input_grad[0])
+        model.forward(x.float(), ctx.network)
+        dL_dx = model.backward(dL_dy.float(), input_gradient=ctx.needs_input_grad[0])
         scale = 1.0 / model.statistics["loss_scale"]
         gradient = wp.to_torch(model.gradients).clone() * scale
         wp.copy(model.gradients, kept)
-        return (wp.to_torch(dL_dx) * scale if dL_dx is not None else None), gradient, None, None
+        return (dL_dx * scale if dL_dx is not None else None), gradient, None, None
 
 
 class Module(torch.nn.Module):
@@ -55,7 +54,3 @@ class Module(torch.nn.Module):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Outputs ``[n, n_output_dims]`` for inputs ``[n, n_input_dims]``."""
         return Evaluate.apply(x, self.parameters_flat, self.model, self.network)
-
-
-def _to_warp(tensor):
-    return wp.from_torch(tensor.detach().to(torch.float32).contiguous(), dtype=wp.float32)

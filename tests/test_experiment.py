@@ -15,8 +15,10 @@ import pytest
 
 from tools import experiment, methods
 from tools.experiment_spec import plan, read_spec
+from tools.methods import load_job
 from tools.metrics import evaluate
-from tools.reference import Reference
+from tools.reference import Reference, make_reference
+from tools.reference_render import Goal
 from tools.results import Budget, Record, append, appending, load_results, read_records
 from wavefront.errors import SceneError, WavefrontError
 
@@ -275,6 +277,24 @@ def test_other_settings_are_refused(at_once, tmp_path, capsys):
     assert command(write(tmp_path, seeds=[1, 2, 3, 4, 5]), folder) == 0
     assert (folder / "results.jsonl").read_bytes().startswith(records)
     assert len(load_results(folder).records) == 10
+
+
+def test_a_reference_that_is_there_is_used(tmp_path):
+    """Whatever its seed is and how its noise was made, if it is good enough."""
+    made = make_reference(
+        load_job(Path(CORNELL_BOX), [*SPEC["overrides"], "integrator.nee=false"], None, 1),
+        Goal(spp=100),
+        tmp_path / "references",
+        seed=5,
+    )
+    spec = write(tmp_path, budgets=[{"spp": 1}], seeds=[1], images="none")
+    assert command(spec, tmp_path / "results", "--references", str(tmp_path / "references")) == 0
+    results = load_results(tmp_path / "results")
+    assert results.reference("cornell-box").account == made.account
+    assert results.image(results.records[0]) is None
+    made.path.unlink()
+    with pytest.raises(WavefrontError, match="file not found"):
+        results.reference("cornell-box")
 
 
 def test_two_processes_are_refused(at_once, tmp_path):

@@ -155,6 +155,9 @@ def test_is_used_again_continued_or_refused(tmp_path, capsys):
     assert load_reference(path).account.image_sha256 == at_once.account.image_sha256
     assert command("--spp", 48, "--seed", 7, "-o", tmp_path) == 2
     assert "made otherwise: seed is 7, but 0" in capsys.readouterr().err
+    assert make_reference(job(), Goal(spp=48), tmp_path, seed=7, exact=False).account.seed == 0
+    with pytest.raises(WavefrontError, match="made otherwise"):
+        make_reference(job(), Goal(spp=49), tmp_path, seed=7, exact=False)
 
 
 @needs_mitsuba

@@ -33,6 +33,19 @@ def machine() -> dict:
     }
 
 
+def require_scipy():
+    """The module `scipy.stats`.
+
+    Raises:
+        WavefrontError: It is not installed.
+    """
+    try:
+        from scipy import stats
+    except ImportError:
+        raise WavefrontError("the package scipy is not installed; it comes with pip install '.[measure]'") from None
+    return stats
+
+
 def _cpu_model():
     try:
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():

@@ -31,7 +31,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from tools import summary
-from tools.bench_common import machine
+from tools.bench_common import machine, require_scipy
 from tools.experiment_spec import PlannedScene, Spec, plan, read_spec
 from tools.methods import RENDERERS, Engine, Job
 from tools.metrics import evaluate
@@ -227,8 +227,10 @@ class Run:
     ):
         self.spec, self.path, self.folder, self.references = spec, path, folder, references
         self.threads, self.device, self.console = threads, device, console
-        warn = lambda message: console.print(f"warning: {message}")  # noqa: E731
-        self.scenes = plan(spec, path, overrides, threads, device, warn)
+        require_scipy()  # now, and not after the last run; so are the metrics
+        for metric in spec.metrics:
+            evaluate(metric, np.ones((16, 16, 3)), np.ones((16, 16, 3)))
+        self.scenes = plan(spec, path, overrides, threads, device, lambda message: console.print(f"warning: {message}"))
         self.machine = machine()
         self.images: dict[str, Reference] = {}
         self.settings_sha256 = {
@@ -262,12 +264,10 @@ class Run:
 
     def _reference(self, scene: PlannedScene) -> SceneEntry:
         """Makes or finds the references of a scene; the first renderer's is what errors are measured with."""
-        made = []
+        made, job, folder = [], scene.reference_job, self.references
         for renderer in scene.reference.renderers:
             self.console.print(f"{scene.name}: reference by {renderer}")
-            made.append(
-                make_reference(scene.reference_job, scene.goal, self.references, renderer, console=self.console)
-            )
+            made.append(make_reference(job, scene.goal, folder, renderer, console=self.console, exact=False))
         reference = self.images[scene.name] = made[0]
         comparisons = compare_stored(reference)
         for comparison in comparisons:

@@ -15,8 +15,8 @@ from msgspec import Meta
 
 from tools.methods import RENDERERS, SEEDS, Job, load_job, scene_name
 from tools.metrics import METRICS
-from tools.reference import target_records
 from tools.reference_render import Goal
+from tools.reference_store import target_records
 from tools.results import Budget, Struct, slug
 from wavefront.errors import SceneError, WavefrontError
 from wavefront.identity import differences

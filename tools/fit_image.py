@@ -1,6 +1,6 @@
 """Teaches a network an image: position in, colour out.
 
-    python -m tools.fit_image IMAGE [-o FOLDER] [--steps 1000] [--config FILE]
+    python -m tools.fit_image IMAGE [-o FOLDER] [--steps 1000] [--config FILE] [--device cuda]
 
 The hello-world of neural fields: a hash grid (Müller et al. 2022) and a small network, trained on colours at random
 positions. Writes a PNG of what the network knows at growing intervals, and prints its PSNR.
@@ -79,11 +79,14 @@ class Fit:
         config: Of the model.
         batch: Positions per step.
         seed: Of the parameters and the positions.
+        device: Where the model is.
     """
 
-    def __init__(self, image: np.ndarray, config: object = CONFIG, batch: int = 1 << 16, seed: int = 0):
+    def __init__(
+        self, image: np.ndarray, config: object = CONFIG, batch: int = 1 << 16, seed: int = 0, device: str = "cpu"
+    ):
         self.image, self.batch = image, batch
-        self.model = nn.Model.from_config(config, 2, 3, seed=seed)
+        self.model = nn.Model.from_config(config, 2, 3, device=device, seed=seed)
         self.rng = np.random.default_rng(seed)
         self.centres = pixel_centres(*image.shape[:2])
 
@@ -111,13 +114,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--batch", type=int, default=1 << 16)
     parser.add_argument("--config", metavar="FILE", help="JSON configuration of the model")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--device", default="cpu", help="of Warp: cpu (the default) or cuda")
     options = parser.parse_args(arguments)
     console = Console()
     try:
         for name in ("steps", "batch"):
             if getattr(options, name) < 1:
                 raise nn.NnError(f"--{name}: found {getattr(options, name)}; allowed: a positive number")
-        fit = Fit(load_image(options.image), options.config or CONFIG, options.batch, options.seed)
+        fit = Fit(load_image(options.image), options.config or CONFIG, options.batch, options.seed, options.device)
         folder = Path(options.output)
         folder.mkdir(parents=True, exist_ok=True)
     except (nn.NnError, OSError) as error:

@@ -31,220 +31,35 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
-import numpy as np
 from rich.console import Console
 
-from tools.bench_common import machine
-from tools.bias_test import BiasTest, find_bias
+from tools.bench_common import machine, require_scipy
 from tools.image_reader import read_image
-from tools.image_test import RATIO_TOLERANCE
 from tools.methods import RENDERERS, Job, load_job, scene_name
 from tools.reference_render import MAKERS, Goal, median_relative_error, relative_error, render
+from tools.reference_store import (
+    DEFAULT_FOLDER,
+    FORMAT,
+    Account,
+    Reference,
+    account_path,
+    find_reference,
+    load_reference,
+    plain,
+    read_account,
+    reference_path,
+    target_records,
+)
 from wavefront.errors import WavefrontError
-from wavefront.identity import explain_differences, scene_hash, scene_records
+from wavefront.identity import explain_differences, scene_hash
 from wavefront.output import check_writable
-from wavefront.scene import description
 from wavefront.scene.images import replacing
 
-FORMAT = 1
-DEFAULT_FOLDER = Path("references")
 DEFAULT_ERROR = 0.01
-# Settings of the integrator that change the noise of an image and not its mean. Others that may come are taken to
-# change the mean until they are named here.
-NOISE_ONLY = ("rr_depth", "nee", "sampler")
+RATIO_TOLERANCE = 0.005  # the 95 % interval of the ratio of the means of two references must meet 1 ± this
 NOISY = 0.02  # width of an interval that says nothing
 
-
-class Account(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
-    """How a reference was made: the JSON file beside it.
-
-    Attributes:
-        format: Of this file.
-        image: Name of the EXR file.
-        image_sha256: Of its bytes.
-        scene: Name of the scene.
-        file: The scene file, as given.
-        overrides: Of the scene's settings.
-        parameters: Of a Mitsuba file.
-        renderer: A key of `tools.methods.RENDERERS`.
-        versions: Of the renderer.
-        seed: Of the random numbers.
-        settings: Film and integrator.
-        target: All that the expected image depends on, see `target_records`.
-        target_sha256: Of `target`.
-        samples_per_pixel: In the image.
-        seconds: Wall time of rendering, loading and compiling apart.
-        error: Relative standard error, see the head of this module.
-        median_error: Median over lit pixels of standard error over luminance.
-        requested: The limits: ``error``, ``spp``, ``seconds``; null: none.
-        reached: Whether `error` is as small as requested; null where no error was.
-        details: Further figures of the renderer.
-        machine: It ran on.
-        date: It ended, UTC.
-    """
-
-    format: int
-    image: str
-    image_sha256: str
-    scene: str
-    file: str
-    overrides: list[str]
-    parameters: dict[str, str]
-    renderer: str
-    versions: dict[str, str]
-    seed: int
-    settings: dict
-    target: dict
-    target_sha256: str
-    samples_per_pixel: int
-    seconds: float
-    error: float
-    median_error: float
-    requested: dict
-    reached: bool | None
-    details: dict
-    machine: dict
-    date: str
-
-
-@dataclasses.dataclass
-class Reference:
-    """A reference.
-
-    Attributes:
-        path: The EXR file.
-        image: Mean radiance, [height, width, 3] float32.
-        variance: Estimated variance of the mean luminance, [height, width] float32.
-        account: How it was made.
-    """
-
-    path: Path
-    image: np.ndarray
-    variance: np.ndarray
-    account: Account
-
-    def check(self, scene: description.Scene) -> None:
-        """Refuses to be the reference of another scene or other settings.
-
-        Raises:
-            WavefrontError: Lists the differences.
-        """
-        differs = explain_differences(_plain(target_records(scene)), self.account.target, "the reference")
-        if differs:
-            raise WavefrontError(f"{self.path}: is a reference of other settings: {differs}")
-
-
-def _plain(value):
-    return json.loads(json.dumps(value))
-
-
-def target_records(scene: description.Scene) -> dict:
-    """All that the expected image of a scene depends on, as plain values: `identity.scene_records` without AOVs and
-    without the settings of the integrator that change the noise alone.
-
-    Lights without extent are found by next-event estimation alone, so in their presence it is part of the target.
-    """
-    records = scene_records(scene)
-    records["film"].pop("aovs", None)
-    unseen = (description.Directional, description.Point, description.Spot)
-    for key in NOISE_ONLY:
-        if key != "nee" or not any(isinstance(emitter, unseen) for emitter in scene.emitters):
-            records["integrator"].pop(key, None)
-    return records
-
-
-def reference_path(folder: Path, name: str, target_sha256: str, renderer: str) -> Path:
-    """The EXR file of a reference."""
-    return Path(folder) / f"{name}-{target_sha256[:12]}.{renderer}.exr"
-
-
-def _account_path(image: Path) -> Path:
-    return image.with_suffix(".json")
-
-
-# --- reading -----------------------------------------------------------------------------------------------------
-
-
-def load_reference(path: str | os.PathLike, scene: description.Scene | None = None) -> Reference:
-    """Reads a reference.
-
-    Args:
-        path: Its EXR file.
-        scene: What it is to be a reference of; None: whatever it is of.
-
-    Raises:
-        WavefrontError: A missing or damaged file, files that do not belong together, or other settings than `scene`,
-            with what differs.
-    """
-    path = Path(path)
-    account = read_account(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise WavefrontError(f"{path}: cannot be read: {error.strerror or error}") from None
-    if hashlib.sha256(data).hexdigest() != account.image_sha256:
-        raise WavefrontError(f"{path}: is not the image that {_account_path(path).name} tells of; make it again")
-    image = read_image(path)
-    if image.variance is None or image.variance.shape[2] != 1:
-        raise WavefrontError(f"{path}: not a reference: it needs the channel variance.Y; {image.note}")
-    reference = Reference(path, image.pixels, image.variance[..., 0], account)
-    if scene is not None:
-        reference.check(scene)
-    return reference
-
-
-def read_account(image: Path) -> Account:
-    """The account beside an image.
-
-    Raises:
-        WavefrontError: It is missing or damaged.
-    """
-    path = _account_path(image)
-    if not image.is_file():
-        raise WavefrontError(f"{image}: file not found")
-    try:
-        account = msgspec.json.decode(path.read_bytes(), type=Account)
-    except OSError as error:
-        raise WavefrontError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except msgspec.MsgspecError as error:
-        raise WavefrontError(f"{path}: not the account of a reference: {error}") from None
-    if account.format != FORMAT:
-        raise WavefrontError(f"{path}: format {account.format}; this version reads {FORMAT}")
-    return account
-
-
-def find_reference(
-    scene_path: str | os.PathLike,
-    overrides: Sequence[str] = (),
-    parameters: dict[str, str] | None = None,
-    folder: str | os.PathLike = DEFAULT_FOLDER,
-    renderer: str | None = None,
-) -> Reference:
-    """The reference of a scene with these settings.
-
-    Args:
-        scene_path: The scene file.
-        overrides: Of its settings, as for `load_scene`.
-        parameters: Of a Mitsuba file.
-        folder: Where references are.
-        renderer: That made it; None: ours, or else any.
-
-    Raises:
-        WavefrontError: There is none; lists in what those of this scene that are there differ.
-    """
-    job = load_job(Path(scene_path), overrides, parameters, threads=1)
-    name, target = scene_name(scene_path), target_records(job.scene)
-    for one in [renderer] if renderer else RENDERERS:
-        path = reference_path(Path(folder), name, scene_hash(target), one)
-        if path.exists():
-            return load_reference(path, job.scene)
-    others = []
-    for path in sorted(Path(folder).glob(f"{name}-*.exr")):
-        account = read_account(path)
-        if renderer in (None, account.renderer):
-            others.append(explain_differences(_plain(target), account.target, path.name))
-    found = "; ".join(others) if others else "it has none of this scene"
-    raise WavefrontError(f"{folder}: no reference of {scene_path} with these settings: {found}")
+__all__ = ["Account", "Reference", "find_reference", "load_reference", "make_reference", "target_records"]
 
 
 # --- making ------------------------------------------------------------------------------------------------------
@@ -258,6 +73,7 @@ def make_reference(
     seed: int = 0,
     every: float = 60.0,
     console: Console | None = None,
+    exact: bool = True,
 ) -> Reference:
     """The reference of a job: the one that is there if it is good enough; else it is rendered, or continued.
 
@@ -269,6 +85,8 @@ def make_reference(
         seed: Of the random numbers.
         every: Seconds between checkpoints.
         console: For progress; None: none.
+        exact: Whether one that is there must have this seed and these settings of the noise too; else it is used
+            whatever they are, if it is good enough.
 
     Raises:
         WavefrontError: A renderer that cannot render the job, a reference that was made otherwise (another seed, say),
@@ -278,14 +96,14 @@ def make_reference(
     if renderer not in MAKERS:
         raise WavefrontError(f"unknown renderer {renderer!r} of references; allowed: {', '.join(MAKERS)}")
     RENDERERS[renderer].check(job)
-    if getattr(job.scene.integrator, "sampler", "independent") != "independent":
+    if job.scene.integrator.sampler != "independent":
+        sampler = job.scene.integrator.sampler
         raise WavefrontError(
-            f"integrator.sampler is {job.scene.integrator.sampler!r}; references take independent samples, whose variance "
-            "is known"
+            f"integrator.sampler is {sampler!r}; a reference takes independent ones: their variance is known"
         )
     target = target_records(job.scene)
     path = reference_path(folder, scene_name(job.path), scene_hash(target), renderer)
-    settings = _plain(
+    settings = plain(
         {
             "film": msgspec.to_builtins(msgspec.structs.asdict(job.scene.film)),
             "integrator": msgspec.to_builtins(msgspec.structs.asdict(job.scene.integrator)),
@@ -293,8 +111,8 @@ def make_reference(
     )
     settings["integrator"].pop("spp", None)
     settings["film"].pop("aovs", None)
-    if path.exists() and _account_path(path).exists():
-        there = _reuse(path, goal, {"seed": seed, "settings": settings})
+    if path.exists() and account_path(path).exists():
+        there = _reuse(path, goal, {"seed": seed, "settings": settings}, exact)
         if there is not None:
             return there
     folder.mkdir(parents=True, exist_ok=True)
@@ -316,7 +134,7 @@ def make_reference(
         versions=RENDERERS[renderer].versions(job.device),
         seed=seed,
         settings=settings,
-        target=_plain(target),
+        target=plain(target),
         target_sha256=scene_hash(target),
         samples_per_pixel=maker.samples,
         seconds=maker.seconds,
@@ -328,12 +146,12 @@ def make_reference(
         machine=machine(),
         date=datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
     )
-    with replacing(_account_path(path)) as temporary:
+    with replacing(account_path(path)) as temporary:
         temporary.write_bytes(msgspec.json.format(msgspec.json.encode(account), indent=2) + b"\n")
     return load_reference(path, job.scene)
 
 
-def _reuse(path: Path, goal: Goal, made: dict) -> Reference | None:
+def _reuse(path: Path, goal: Goal, made: dict, exact: bool) -> Reference | None:
     """The reference at `path` if it is good enough, None if it is to be continued.
 
     Raises:
@@ -341,12 +159,11 @@ def _reuse(path: Path, goal: Goal, made: dict) -> Reference | None:
     """
     account = read_account(path)
     differs = explain_differences(made, {"seed": account.seed, "settings": account.settings}, path.name)
-    if differs:
+    enough = goal.reached(account.samples_per_pixel, account.seconds, account.error)
+    if differs and (exact or not enough):
         raise WavefrontError(f"{path}: is there, made otherwise: {differs}; choose another folder or remove it")
-    if not goal.reached(account.samples_per_pixel, account.seconds, account.error):
-        return None
     try:
-        return load_reference(path)
+        return load_reference(path) if enough else None
     except WavefrontError:  # killed between its image and its account; the checkpoint has the samples
         return None
 
@@ -354,14 +171,20 @@ def _reuse(path: Path, goal: Goal, made: dict) -> Reference | None:
 # --- two renderers -----------------------------------------------------------------------------------------------
 
 
-def compare_references(a: Path, b: Path) -> tuple[BiasTest, str]:
+def compare_references(a: Path, b: Path):
     """Tests whether two references are of one image, see `tools.bias_test`.
 
     Returns:
-        The test of `a` against `b`, and the verdict: ``differs`` if a tile does at the false alarm rate of the test, or
-        if the 95 % interval of the ratio of means does not meet 1 ± 0.005; else ``noisy`` if that is wider than 0.02,
-        or ``same``.
+        The `BiasTest` of `a` against `b`, and the verdict: ``differs`` if a tile does at the false alarm rate of the
+        test, or if the 95 % interval of the ratio of means does not meet 1 ± 0.005; else ``noisy`` if that is wider
+        than 0.02, or ``same``.
+
+    Raises:
+        WavefrontError: An image cannot be read, or scipy is not installed.
     """
+    require_scipy()
+    from tools.bias_test import find_bias  # only here: it needs scipy
+
     test = find_bias(read_image(a), read_image(b))
     low, high = test.ratio()[1] if test.ratio() else (1.0, 1.0)  # of black images
     if test.failing_tiles or low > 1.0 + RATIO_TOLERANCE or high < 1.0 - RATIO_TOLERANCE:

@@ -28,7 +28,7 @@ from msgspec import Meta
 
 from tools.bench_common import ROOT
 from tools.image_reader import read_image
-from tools.reference import Reference, load_reference
+from tools.reference_store import Reference, load_reference
 from wavefront.errors import WavefrontError
 from wavefront.scene.images import replacing
 

@@ -19,8 +19,8 @@ from collections.abc import Sequence
 
 import numpy as np
 from rich.table import Table
-from scipy import stats
 
+from tools.bench_common import require_scipy
 from tools.results import Budget, Record, Results
 
 CONFIDENCE = 0.95
@@ -51,13 +51,18 @@ class Figure:
         return f"{self.mean:.3g} ({self.low:.3g} to {self.high:.3g})"
 
 
+def _student(degrees: float) -> float:
+    """Half the width of an interval in standard errors."""
+    return float(require_scipy().t.isf((1.0 - CONFIDENCE) / 2.0, degrees))
+
+
 def mean_figure(values: Sequence[float]) -> Figure:
     """Mean of independent values and its interval by Student's t; none for one value."""
     values = np.asarray(values, float)
     n, mean = len(values), float(np.mean(values))
     if n < 2:
         return Figure(mean)
-    half = float(stats.t.isf((1.0 - CONFIDENCE) / 2.0, n - 1) * values.std(ddof=1) / math.sqrt(n))
+    half = _student(n - 1) * float(values.std(ddof=1)) / math.sqrt(n)
     return Figure(mean, mean - half, mean + half)
 
 
@@ -78,7 +83,7 @@ def ratio_figure(a: Sequence[float], b: Sequence[float]) -> Figure:
     if variance == 0.0:
         return Figure(ratio, ratio, ratio)
     degrees = variance**2 / sum(part**2 / (len(v) - 1) for part, v in zip(parts, (a, b), strict=True))
-    factor = math.exp(float(stats.t.isf((1.0 - CONFIDENCE) / 2.0, degrees)) * math.sqrt(variance))
+    factor = math.exp(_student(degrees) * math.sqrt(variance))
     return Figure(ratio, ratio / factor, ratio * factor)
 
 

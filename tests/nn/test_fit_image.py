@@ -47,3 +47,9 @@ def test_command(tmp_path, capsys):
 def test_errors_are_one_line(arguments, words, capsys):
     assert fit_image.main(arguments) == 2
     assert capsys.readouterr().err == words
+
+
+def test_an_unknown_device_is_named(tmp_path, capsys):
+    Image.new("RGB", (4, 4)).save(tmp_path / "a.png")
+    assert fit_image.main([str(tmp_path / "a.png"), "--device", "gpu"]) == 2
+    assert capsys.readouterr().err == "error: device: found 'gpu'; Invalid device identifier: gpu\n"

@@ -7,6 +7,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from nn_models import make  # noqa: E402
 from test_nn_values import inputs  # noqa: E402
 
 import nn  # noqa: E402
@@ -73,6 +74,29 @@ def test_module_trains_with_an_optimiser_of_torch():
         optimizer.step()
     assert loss.item() < 0.8 * first
     np.testing.assert_array_equal(model.inference(x.detach().numpy()), module(x).detach().numpy())
+
+
+def test_tensors_are_shared_not_copied():
+    """Results are of the kind of the inputs, in the memory that was given."""
+    model = make(n_in=3, n_out=4)
+    x, target = torch.rand(64, 3), torch.rand(64, 4)
+    out = torch.empty(64, 4)
+    expected = model.inference(x.numpy())
+    assert model.inference(x, out=out) is out
+    np.testing.assert_array_equal(out.numpy(), expected)
+    y = model.inference(x.clone().requires_grad_())
+    assert isinstance(y, torch.Tensor) and not y.requires_grad
+    np.testing.assert_array_equal(y.numpy(), expected)
+    np.testing.assert_array_equal(model.inference(x.t().contiguous().t()).numpy(), expected)
+    latent = model.encode(0, x)
+    index = torch.arange(63, -1, -1)
+    for one in (index, index.int()):
+        np.testing.assert_array_equal(model.inference(x, latents={0: (latent, one)}).numpy(), expected[::-1])
+    assert model.train_step(x, target) == make(n_in=3, n_out=4).train_step(x.numpy(), target.numpy())
+    model.forward(x)
+    assert isinstance(model.backward(target, input_gradient=True), torch.Tensor)
+    with pytest.raises(nn.NnError, match=r"x: found torch\.float64; allowed: a NumPy or Warp array, or a tensor"):
+        model.inference(x.double())
 
 
 def test_benchmark_runs():
