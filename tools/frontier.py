@@ -28,8 +28,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import stats
 
+from tools.bench_common import require_scipy
 from tools.metrics import MRSE_EPSILON, RELMSE_EPSILON
 from tools.results import Budget
 from tools.summary import Figure, mean_figure
@@ -102,7 +102,7 @@ def surely_less(a: Sequence[float], b: Sequence[float], level: float) -> bool:
     if n < 2 or not mean > 0.0:
         return False
     error = float(difference.std(ddof=1)) / math.sqrt(n)
-    return error == 0.0 or float(stats.t.sf(mean / error, n - 1)) <= level
+    return error == 0.0 or float(require_scipy().t.sf(mean / error, n - 1)) <= level
 
 
 def faster(a: Setting, b: Setting, level: float) -> bool:

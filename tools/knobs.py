@@ -69,6 +69,7 @@ KNOBS: dict[str, Knob] = {
         Knob("max_depth", "integrator.max_depth", (2, 4, 8, 16), ("time", "bias"), least_biased=_longest),
         Knob("rr_depth", "integrator.rr_depth", (2, 5, 10, None), ("time", "variance", "compile")),
         Knob("nee", "integrator.nee", (True, False), ("time", "variance", "memory", "compile")),
+        Knob("sampler", "integrator.sampler", ("independent", "sobol"), ("time", "variance", "compile")),
         Knob("filter", "film.filter.type", ("box", "tent", "gaussian"), ("variance", "bias", "compile"), _filter),
     )
 }

@@ -31,14 +31,13 @@ from tools.sweep import Changes, Section, Sweep, make_plan, method_name
 from wavefront.errors import WavefrontError
 from wavefront.presets import NAMES, Preset, load_preset, preset_path
 
-# What light does in them differs: diffuse light alone, an indirectly lit room, caustics and glossy things, a mesh in
-# sunlight. Those of the folder WAVEFRONT_SCENES are left out where it is not set.
+# What light does in them differs: diffuse reflection, rooms that are lit through a gap, glossy and transparent things.
+# Those of the folder WAVEFRONT_SCENES are left out where it is not set.
 SCENES = (
     "scenes/cornell-box.json",
     "scenes/door-ajar.json",
     "scenes/still-life.glb",
     "${WAVEFRONT_SCENES}/veach-ajar/scene.xml",
-    "${WAVEFRONT_SCENES}/bathroom/scene.xml",
 )
 OVERRIDES = (
     "film.width=48",
@@ -109,9 +108,7 @@ def check(presets: list[Preset], sweep: Sweep, sections: list[Section]) -> list[
 
         def verdict_in(section: Section, preset=preset, key=key) -> tuple[Setting, Verdict]:
             # One that may be biased is compared with all; any other with those that are not.
-            rivals = [
-                s for s in section.settings if preset.biased_by or not sweep.plan.is_biased(sweep.methods[s.method])
-            ]
+            rivals = [s for s in section.settings if preset.biased_by or not sweep.is_biased(s.method)]
             at = next(i for i, s in enumerate(rivals) if (s.method, s.budget.spp) == key)
             return rivals[at], verdicts(rivals)[at]
 
@@ -169,7 +166,7 @@ def origin(checked: Checked, sections: list[Section], files: list[str], sweep: S
         "frontier": [
             {
                 "setting": s.name,
-                "biased": sweep.plan.is_biased(sweep.methods[s.method]),
+                "biased": sweep.is_biased(s.method),
                 "seconds": rounded(float(np.mean(s.seconds))),
                 "error": rounded(float(np.mean(s.errors))),
             }
@@ -191,8 +188,8 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
 
     presets = [load_preset(name) for name in NAMES]
     wanted = [changes_of(preset) for preset in presets]
-    most = max(spp for spp, _ in wanted)
-    sizes = sorted({1 << k for k in range(2, most.bit_length())} | {spp for spp, _ in wanted})
+    *small, most = sorted(spp for spp, _ in wanted)
+    sizes = sorted({1 << k for k in range(2, small[-1].bit_length())} | {*small})
     files = scenes(console)
     plan = make_plan(
         [scene_path(file) for file in files],
@@ -203,6 +200,7 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
         METRIC,
         reference_of(arguments),
         [*OVERRIDES, *arguments.override],
+        more=most,
     )
     folder = arguments.output or Path("results") / "presets"
     extra = []

@@ -5,6 +5,9 @@ settings and every other value of every knob, one at a time. Each further round 
 of the means so far: methods of which some budget is on it, unless both turn a knob to different values. A sweep that
 is killed goes on where it was: the rounds follow from the records.
 
+After the last round, methods that are on the frontier at the largest number of samples may go on with more
+(`Plan.more`), which saves what the others would take.
+
 Budgets in samples share runs: the image of a run at a power of two of its samples is to the last bit that of a run
 with so many, so that one run of the largest number measures all. Where a knob trains, each number has runs of its own.
 """
@@ -17,15 +20,16 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from rich.console import Console
 
-from tools.experiment import Run
+from tools.experiment import Run, write_summary
 from tools.experiment_spec import MethodSpec, PlannedScene, ReferenceSpec, SceneSpec, Spec
 from tools.frontier import SQUARES, Setting, Verdict, bias_figure, error_products, joined, pareto, verdicts
 from tools.knobs import KNOBS, Knob, Value, label
 from tools.methods import Job, load_job, scene_name
-from tools.results import Budget, Results
+from tools.results import EXPERIMENT, Budget, Experiment, Results, write_json
 from tools.setting_cost import Cost, measure_all
 from tools.summary import Figure
 from wavefront.errors import SceneError, WavefrontError
@@ -47,6 +51,7 @@ class Plan:
         unbiased: By knob, the value of the references.
         budgets: Largest last.
         sizes: Samples per pixel that are settings; empty if budgets are seconds.
+        more: Samples per pixel for those alone that are on the frontier at the largest of `sizes`; None: no more.
         seeds: Of the runs.
         metric: Of `tools.metrics`.
         reference: How references are made.
@@ -61,6 +66,7 @@ class Plan:
     seeds: list[int]
     metric: str
     reference: ReferenceSpec
+    more: int | None = None
 
     def overrides(self, changes: Changes) -> list[str]:
         """From a scene of the spec to one with these changes."""
@@ -71,12 +77,10 @@ class Plan:
                 found += KNOBS[name].overrides(value)
         return found
 
-    def is_biased(self, changes: Changes) -> bool:
-        """Whether a knob that trades bias is not where the reference has it."""
-        return any(
-            "bias" in KNOBS[name].trades and not same(changes.get(name, own), self.unbiased[name])
-            for name, own in self.own.items()
-        )
+    @property
+    def all_budgets(self) -> list[Budget]:
+        """With that of the methods that go on."""
+        return self.budgets + ([Budget(spp=self.more)] if self.more else [])
 
 
 def same(a: Value, b: Value) -> bool:
@@ -94,6 +98,7 @@ def make_plan(
     reference: ReferenceSpec,
     overrides: Sequence[str] = (),
     parameters: dict[str, str] | None = None,
+    more: int | None = None,
 ) -> Plan:
     """Reads the scenes, and says what will be swept.
 
@@ -107,6 +112,7 @@ def make_plan(
         reference: How references are made.
         overrides: Of all scenes.
         parameters: Of Mitsuba files.
+        more: See `Plan`.
 
     Raises:
         WavefrontError: A scene that cannot be read, a value that it refuses, or scenes that do not have the same
@@ -158,7 +164,7 @@ def make_plan(
         alone = [size for size in sorted(sizes) if size != most and (whole or size & (size - 1))]
         budgets = [Budget(spp=size) for size in [*alone, most]]
     return Plan(
-        scenes, own, values, unbiased, budgets, tuple(sorted(sizes)), list(range(1, seeds + 1)), metric, reference
+        scenes, own, values, unbiased, budgets, tuple(sorted(sizes)), list(range(1, seeds + 1)), metric, reference, more
     )
 
 
@@ -246,7 +252,7 @@ def settings_of(results: Results, scene: str, plan: Plan) -> list[Setting]:
                 seconds = tuple(record.seconds.render for record in records)
                 found.append(Setting(method, budget, seconds, tuple(r.errors[plan.metric] for r in records)))
             continue
-        for size in plan.sizes:
+        for size in [*plan.sizes, *([plan.more] if Budget(spp=plan.more) in by_budget else [])]:
             budget = Budget(spp=size)
             records = by_budget.get(budget, by_budget[plan.budgets[-1]])
             points = [next(point for point in record.points if point.samples == size) for record in records]
@@ -255,17 +261,17 @@ def settings_of(results: Results, scene: str, plan: Plan) -> list[Setting]:
     return found
 
 
-def find_biases(results: Results, scene: str, plan: Plan, methods: dict[str, Changes]) -> dict[str, Figure | None]:
-    """The bias of every method, see `tools.frontier`; from the images of the largest budget."""
-    control = next((name for name, changes in methods.items() if not plan.is_biased(changes)), None)
+def find_biases(results: Results, scene: PlannedScene, plan: Plan) -> dict[str, Figure | None]:
+    """The bias of every method, see `tools.frontier`; from the images of the largest budget that all have."""
+    control = next((name for name, notes in scene.notes.items() if not notes), None)
     if plan.metric not in SQUARES or control is None:
-        return dict.fromkeys(methods)
-    reference = results.reference(scene).image
+        return dict.fromkeys(scene.notes)
+    reference = results.reference(scene.name).image
     products = {}
-    for name in methods:
-        records = [r for r in results.records if (r.scene, r.method, r.budget) == (scene, name, plan.budgets[-1])]
+    for name in scene.notes:
+        records = [r for r in results.records if (r.scene, r.method, r.budget) == (scene.name, name, plan.budgets[-1])]
         products[name] = error_products([results.image(record) for record in records], reference, plan.metric)
-    return {name: bias_figure(products[name], products[control]) for name in methods if name != control} | {
+    return {name: bias_figure(products[name], products[control]) for name in products if name != control} | {
         control: Figure(0.0, 0.0, 0.0)
     }
 
@@ -299,6 +305,7 @@ class Sweep:
         self.extra = list(extra)
         self.methods: dict[str, Changes] = {}
         self.planned: list[PlannedScene] = []
+        self.experiment: Experiment | None = None
 
     def go(self, rounds: int, whole: bool = False) -> Results:
         """Measures all.
@@ -322,24 +329,39 @@ class Sweep:
             chosen += new
             extra = [changes for changes in self.extra if changes not in chosen]
             results = self._measure([*chosen, *extra], f"round {number + 1} of pairs from the frontier")
+        if self.plan.more:
+            largest = self._on_frontier(results, [method_name(c) for c in chosen], self.plan.budgets[-1])
+            last = [changes for changes in chosen if method_name(changes) in largest or not changes]
+            last += [changes for changes in self.extra if changes not in last]
+            results = self._measure(last, f"{self.plan.more} spp", more=True)
         return results
 
-    def _on_frontier(self, results: Results, methods: Sequence[str]) -> set[str]:
-        """Methods with a setting on the frontier of the means, of all scenes together and of these methods alone."""
-        settings = [setting for setting in self._together(results) if setting.method in methods]
+    def is_biased(self, method: str, scene: str | None = None) -> bool:
+        """Whether a method makes another image than the reference's, of a scene or of any."""
+        return any(planned.notes[method] for planned in self.planned if scene in (None, planned.name))
+
+    def _on_frontier(self, results: Results, methods: Sequence[str], budget: Budget | None = None) -> set[str]:
+        """Methods with a setting on the frontier of the means, of all scenes together and of these methods alone, with
+        this budget or any."""
+        settings = [
+            setting
+            for setting in self._together(results)
+            if setting.method in methods and budget in (None, setting.budget)
+        ]
         kept = pareto([np.mean(s.seconds) for s in settings], [np.mean(s.errors) for s in settings])
         return {setting.method for setting, on in zip(settings, kept, strict=True) if on}
 
     def _together(self, results: Results) -> list[Setting]:
         return joined([settings_of(results, scene.name, self.plan) for scene in self.plan.scenes])
 
-    def _measure(self, chosen: Sequence[Changes], words: str) -> Results:
-        self.methods = {method_name(changes): changes for changes in chosen}
-        self.console.print(f"{self.name}: {words}: {len(chosen)} settings in all")
+    def _measure(self, chosen: Sequence[Changes], words: str, more: bool = False) -> Results:
+        chosen_methods = {method_name(changes): changes for changes in chosen}
+        self.methods |= chosen_methods
+        self.console.print(f"{self.name}: {words}: {len(chosen)} methods")
         spec = Spec(
             scenes=self.plan.scenes,
-            methods=[MethodSpec(name=n, overrides=self.plan.overrides(c)) for n, c in self.methods.items()],
-            budgets=self.plan.budgets,
+            methods=[MethodSpec(name=n, overrides=self.plan.overrides(c)) for n, c in chosen_methods.items()],
+            budgets=self.plan.all_budgets[-1:] if more else self.plan.budgets,
             seeds=self.plan.seeds,
             metrics=[self.plan.metric],
             baseline=DEFAULT,
@@ -347,8 +369,14 @@ class Sweep:
             images="run" if self.plan.metric in SQUARES else "none",
         )
         run = Run(spec, Path(self.name), self.folder, self.references, [], self.threads, self.device, self.console)
-        self.planned = run.scenes
-        return run.go()
+        if not more:
+            self.planned, results = run.scenes, run.go()
+            self.experiment = results.experiment
+            return results
+        run.go()
+        # The folder tells of all methods, and not of the last alone.
+        write_json(self.folder / EXPERIMENT, msgspec.structs.replace(self.experiment, budgets=self.plan.all_budgets))
+        return write_summary(self.folder)
 
     def sections(self, results: Results, with_costs: bool = True) -> list[Section]:
         """What was found: scene by scene, and last of all scenes together if there are several.
@@ -359,7 +387,7 @@ class Sweep:
         found = []
         for scene in self.planned:
             settings = settings_of(results, scene.name, self.plan)
-            biases = find_biases(results, scene.name, self.plan, self.methods)
+            biases = find_biases(results, scene, self.plan)
             costs = measure_all(scene, self.methods, self.folder, self.console.print) if with_costs else {}
             found.append(Section(scene.name, settings, verdicts(settings), biases, costs))
         if len(found) > 1:

@@ -81,6 +81,9 @@ def build_parser() -> argparse.ArgumentParser:
     budget = parser.add_mutually_exclusive_group()
     budget.add_argument("--spp", metavar="N,N,...", help=f"default {','.join(map(str, KNOBS[SPP].values))}")
     budget.add_argument("--seconds", metavar="S,S,...", help="of rendering, instead of samples")
+    parser.add_argument(
+        "--more-spp", type=int, metavar="N", help="for those alone that are on the frontier at the largest of --spp"
+    )
     parser.add_argument("--seeds", type=int, default=5, metavar="N", help="runs of each setting; default 5")
     parser.add_argument("--metric", metavar="NAME", help=f"default {DEFAULT_METRIC}")
     parser.add_argument(
@@ -137,16 +140,20 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
         raise WavefrontError(f"--seeds {arguments.seeds}; allowed: 1 to {SEEDS - 1}")
     if arguments.rounds < 0:
         raise WavefrontError(f"--rounds {arguments.rounds}; allowed: 0 or more")
+    sizes, more = () if seconds else sizes or KNOBS[SPP].values, arguments.more_spp
+    if more is not None and not (sizes and max(sizes) < more < 2**31):
+        raise WavefrontError(f"--more-spp {more}; allowed: more than the largest of --spp, and not with --seconds")
     return make_plan(
         arguments.scenes,
         knobs,
-        () if seconds else sizes or KNOBS[SPP].values,
+        sizes,
         seconds,
         arguments.seeds,
         metric,
         reference_of(arguments),
         arguments.override,
         definitions(arguments.define),
+        more,
     )
 
 

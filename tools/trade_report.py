@@ -108,7 +108,7 @@ def remarks(sections: list[Section], sweep: Sweep, results: Results) -> list[str
                 f"(relative standard error {scene.reference.error:.2g})"
             )
         for method, bias in section.biases.items():
-            if bias is not None and bias.low > 0.0 and not plan.is_biased(sweep.methods[method]):
+            if bias is not None and bias.low > 0.0 and not sweep.is_biased(method, scene.name):
                 lines.append(f"{scene.name}, {method}: no knob of it trades bias, but a bias was found: {bias}")
     return lines
 

@@ -106,13 +106,14 @@ def image_attributes(renderer: Renderer) -> dict[str, int | str]:
     }
 
 
-def describe_render(renderer: Renderer, source: str, started: float) -> dict:
+def describe_render(renderer: Renderer, source: str, started: float, preset: dict | None = None) -> dict:
     """The account of a render, for OUT.json.
 
     Args:
         renderer: After rendering.
         source: Path of the scene, as given.
         started: `time.perf_counter()` at the start of the program.
+        preset: From `Preset.account`, if there was one.
     """
     s = renderer.statistics
     seconds = max(s.render_seconds, 1e-9)
@@ -125,6 +126,7 @@ def describe_render(renderer: Renderer, source: str, started: float) -> dict:
             "seed": renderer.seed,
             "threads": renderer.threads,
         },
+        "preset": preset,
         "features": dataclasses.asdict(renderer.features),
         "versions": {
             "wavefront": wavefront.__version__,

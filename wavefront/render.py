@@ -30,6 +30,7 @@ from wavefront.output import (
     output_paths,
     write_outputs,
 )
+from wavefront.presets import NAMES, load_preset
 from wavefront.renderer import Renderer
 from wavefront.sampler import SAMPLERS
 from wavefront.scene import Scene, json_format, load_scene
@@ -116,6 +117,11 @@ def build_parser() -> argparse.ArgumentParser:
     output.add_argument("--exposure", type=float, default=0.0, metavar="STOPS", help="of the PNG only; default 0")
 
     sampling = parser.add_argument_group("sampling")
+    sampling.add_argument(
+        "--preset",
+        metavar="NAME",
+        help=f"{', '.join(NAMES)}: measured settings in place of the scene's; other options win",
+    )
     budget = sampling.add_mutually_exclusive_group()
     budget.add_argument("--spp", type=int, metavar="N", help="samples per pixel; default: the scene's")
     budget.add_argument("--time", type=float, metavar="S", help="render for S seconds instead")
@@ -172,8 +178,12 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def overrides_from(arguments: argparse.Namespace) -> list[str]:
-    """The settings on the command line as overrides of the scene's keys; `--set` comes last and wins."""
-    overrides = []
+    """The settings on the command line as overrides of the scene's keys: a preset comes first, `--set` last and wins.
+
+    Raises:
+        WavefrontError: There is no such preset.
+    """
+    overrides = load_preset(arguments.preset).overrides if arguments.preset is not None else []
     if arguments.size:
         overrides += [f"film.width={arguments.size[0]}", f"film.height={arguments.size[1]}"]
     if arguments.crop:
@@ -393,6 +403,11 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
     resume, checkpoint = check_checkpoints(arguments, output)
     scene = load_scene(arguments.scene, overrides_from(arguments), definitions_from(arguments), warn)
     check_not_read(output, arguments.scene, scene)
+    preset = None
+    if arguments.preset is not None:
+        preset = load_preset(arguments.preset).account(scene, timed=seconds is not None)
+        bias = f"; biased by {', '.join(preset['biased_by'])}" if preset["biased_by"] else ""
+        console.print(f"preset {arguments.preset}{bias}", highlight=False, soft_wrap=True)
     renderer = make_renderer(arguments, scene, console)
     for note in renderer.device_scene.notes:
         warn(note)
@@ -415,8 +430,9 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
         raise WavefrontError(f"{error}; no image was written{kept}") from None
     if checkpoints is not None:
         checkpoints.write()
+    account = describe_render(renderer, arguments.scene, started, preset)
     try:
-        write_outputs(output, renderer, arguments.exposure, describe_render(renderer, arguments.scene, started))
+        write_outputs(output, renderer, arguments.exposure, account)
     except HalfOverflowError:
         raise
     except (WavefrontError, MemoryError) as error:
