@@ -24,6 +24,7 @@ is the part of the error that no number of samples removes. Its interval is that
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 
@@ -101,8 +102,13 @@ def surely_less(a: Sequence[float], b: Sequence[float], level: float) -> bool:
     n, mean = len(difference), float(np.mean(difference))
     if n < 2 or not mean > 0.0:
         return False
-    error = float(difference.std(ddof=1)) / math.sqrt(n)
-    return error == 0.0 or float(require_scipy().t.sf(mean / error, n - 1)) <= level
+    return mean >= _student(level, n - 1) * float(difference.std(ddof=1)) / math.sqrt(n)
+
+
+@functools.lru_cache
+def _student(level: float, degrees: int) -> float:
+    """What Student's t exceeds with this probability."""
+    return float(require_scipy().t.isf(level, degrees))
 
 
 def faster(a: Setting, b: Setting, level: float) -> bool:

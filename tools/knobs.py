@@ -1,8 +1,8 @@
 """The knobs that a user has: what a sweep of `tools.trade` may turn, and what each of them trades.
 
 A knob joins by one line in `KNOBS`. Its values are swept one at a time around those of the scene, see `tools.trade`.
-What a knob trades says what is measured of it: a *bias* is told apart from the variance against the reference of the
-unrestricted scene, and compile time and memory are taken for each value in a process of its own.
+It says what it trades; a *bias* is a change of the expected image, and is measured against the reference of the
+unrestricted scene.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ KNOBS: dict[str, Knob] = {
     knob.name: knob
     for knob in (
         Knob(SPP, "integrator.spp", (4, 8, 16, 32, 64), ("time", "variance")),
-        Knob("max_depth", "integrator.max_depth", (2, 4, 8, 16), ("time", "bias"), least_biased=_longest),
+        Knob("max_depth", "integrator.max_depth", (2, 4, 8, 16), ("time", "bias", "compile"), least_biased=_longest),
         Knob("rr_depth", "integrator.rr_depth", (2, 5, 10, None), ("time", "variance", "compile")),
         Knob("nee", "integrator.nee", (True, False), ("time", "variance", "memory", "compile")),
         Knob("sampler", "integrator.sampler", ("independent", "sobol"), ("time", "variance", "compile")),

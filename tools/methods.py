@@ -21,6 +21,7 @@ import wavefront
 from tools.peers import mitsuba as peer
 from tools.peers.mitsuba_records import integrator_of
 from wavefront.errors import WavefrontError
+from wavefront.identity import scene_hash
 from wavefront.renderer import Renderer
 from wavefront.scene import description, load_scene
 
@@ -161,6 +162,7 @@ class Wavefront:
     def account(self) -> dict:
         s = self.renderer.statistics
         return {
+            "features": scene_hash(dataclasses.asdict(self.renderer.features)),  # same kernels, same buffers
             "paths": s.paths,
             "rays": s.rays,
             "shadow_rays": s.shadow_rays,

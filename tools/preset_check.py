@@ -80,6 +80,11 @@ def changes_of(preset: Preset) -> tuple[int, Changes]:
     return spp, changes
 
 
+def of_scenes(sections: list[Section]) -> list[Section]:
+    """The sections of single scenes; the last one is that of all."""
+    return sections[:-1] or sections
+
+
 @dataclasses.dataclass
 class Checked:
     """A preset among the settings of all scenes.
@@ -88,13 +93,13 @@ class Checked:
         preset: It.
         setting: What it is among the settings.
         verdict: On it, of all scenes together.
-        of_scenes: By scene, the verdict on that scene alone.
+        of_each: By scene, the verdict on that scene alone.
     """
 
     preset: Preset
     setting: Setting
     verdict: Verdict
-    of_scenes: dict[str, Verdict]
+    of_each: dict[str, Verdict]
 
 
 def check(presets: list[Preset], sweep: Sweep, sections: list[Section]) -> list[Checked]:
@@ -113,7 +118,7 @@ def check(presets: list[Preset], sweep: Sweep, sections: list[Section]) -> list[
             return rivals[at], verdicts(rivals)[at]
 
         setting, verdict = verdict_in(sections[-1])
-        found.append(Checked(preset, setting, verdict, {s.name: verdict_in(s)[1] for s in sections[:-1]}))
+        found.append(Checked(preset, setting, verdict, {s.name: verdict_in(s)[1] for s in of_scenes(sections)}))
     return found
 
 
@@ -128,7 +133,7 @@ def table(checked: list[Checked]) -> Table:
     view.add_column("of each")
     for one in checked:
         words = one.verdict.kind + (f" by {one.verdict.by}" if one.verdict.by else "")
-        of_each = "; ".join(f"{name}: {v.kind}" + (f" by {v.by}" if v.by else "") for name, v in one.of_scenes.items())
+        of_each = "; ".join(f"{name}: {v.kind}" + (f" by {v.by}" if v.by else "") for name, v in one.of_each.items())
         seconds, errors = mean_figure(one.setting.seconds), mean_figure(one.setting.errors)
         view.add_row(one.preset.name, one.setting.name, str(seconds), str(errors), words, of_each)
     return view
@@ -146,12 +151,12 @@ def origin(checked: Checked, sections: list[Section], files: list[str], sweep: S
             return {key: rounded(one) for key, one in value.items()}
         return float(f"{value:.4g}") if isinstance(value, float) else value
 
-    of_scenes = []
-    for file, section in zip(files, sections[:-1], strict=True):
+    measured = []
+    for file, section in zip(files, of_scenes(sections), strict=True):
         setting = next(s for s in section.settings if s.name == checked.setting.name)
         bias = section.biases.get(setting.method)
         entry = {"file": file, **figures(setting), "bias": bias and bias.plain()}
-        of_scenes.append({**rounded(entry), "verdict": checked.of_scenes[section.name].kind})
+        measured.append({**rounded(entry), "verdict": checked.of_each[section.name].kind})
     pairs = zip(together.settings, together.verdicts, strict=True)
     frontier = sorted((s for s, v in pairs if v.kind == FRONTIER), key=lambda s: np.mean(s.seconds))
     return {
@@ -161,7 +166,7 @@ def origin(checked: Checked, sections: list[Section], files: list[str], sweep: S
         "metric": METRIC,
         "runs": len(sweep.plan.seeds),
         "overrides": list(sweep.plan.scenes[0].overrides),
-        "scenes": of_scenes,
+        "scenes": measured,
         "all_scenes": {**rounded(figures(checked.setting)), "verdict": checked.verdict.kind},
         "frontier": [
             {
@@ -181,9 +186,10 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
     Raises:
         WavefrontError: With the one line that the user needs.
     """
-    for option in ("scenes", "knob", "grid", "spp", "seconds", "metric", "define", "json"):
+    for option in ("scenes", "knob", "grid", "spp", "seconds", "more_spp", "metric", "define", "json"):
         if getattr(arguments, option):
-            raise WavefrontError(f"{option} together with --check-presets, which has scenes and settings of its own")
+            what = "a scene" if option == "scenes" else f"--{option.replace('_', '-')}"
+            raise WavefrontError(f"{what} together with --check-presets, which has scenes and settings of its own")
     from tools.trade import reference_of
 
     presets = [load_preset(name) for name in NAMES]

@@ -8,7 +8,6 @@ where there is no pool).
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -17,11 +16,10 @@ import msgspec
 
 from tools.bench_common import Child, peak_memory_bytes, serve
 from tools.experiment_spec import PlannedScene
-from tools.knobs import KNOBS
 from tools.methods import RENDERERS
 from tools.results import write_json
 from wavefront.errors import WavefrontError
-from wavefront.identity import scene_hash, scene_records
+from wavefront.identity import scene_hash
 
 
 class Cost(msgspec.Struct, forbid_unknown_fields=True):
@@ -44,20 +42,14 @@ def measure(job: dict) -> Cost:
         return Cost(**child.ask({}))
 
 
-def cost_class(changes: dict, method: str) -> str:
-    """Settings of one class have the same cost: those that differ in knobs alone that trade neither."""
-    kept = {name: value for name, value in changes.items() if {"compile", "memory"} & set(KNOBS[name].trades)}
-    return json.dumps(kept, sort_keys=True)
-
-
 def measure_all(
-    scene: PlannedScene, methods: dict[str, dict], folder: Path, progress: Callable[[str], object]
+    scene: PlannedScene, features: dict[str, str], folder: Path, progress: Callable[[str], object]
 ) -> dict[str, Cost]:
-    """The costs of all methods on a scene, those of one class measured once and kept in the file ``costs.json``.
+    """The costs of all methods on a scene, measured once for those with the same kernels and kept in ``costs.json``.
 
     Args:
         scene: Planned, with a job for each method.
-        methods: By name, the knobs it turns.
+        features: By method, the hash of what its kernels are built for.
         folder: Of the results.
         progress: Called with what is being measured.
 
@@ -69,19 +61,18 @@ def measure_all(
         known = msgspec.json.decode(path.read_bytes(), type=dict[str, Cost]) if path.exists() else {}
     except msgspec.MsgspecError as error:
         raise WavefrontError(f"{path}: damaged: {error}") from None
-    keys: dict[str, str] = {}  # by class
     found = {}
-    for name, changes in methods.items():
-        kind, job = cost_class(changes, name), scene.jobs[name]
-        if kind not in keys:
-            versions = RENDERERS["wavefront"].versions(job.device)
-            keys[kind] = scene_hash([scene_hash(scene_records(job.scene)), job.threads, job.device, versions])
-        if keys[kind] not in known:
+    for name, digest in features.items():
+        job = scene.jobs[name]
+        film = job.scene.film
+        versions = RENDERERS["wavefront"].versions(job.device)
+        key = scene_hash([scene.name, film.width, film.height, digest, job.threads, job.device, versions])
+        if key not in known:
             progress(f"{scene.name}, {name}: compile time and memory")
             request = {"scene": str(job.path), "overrides": job.overrides, "parameters": dict(job.parameters)}
-            known[keys[kind]] = measure({**request, "threads": job.threads, "device": job.device})
+            known[key] = measure({**request, "threads": job.threads, "device": job.device})
             write_json(path, known)
-        found[name] = known[keys[kind]]
+        found[name] = known[key]
     return found
 
 

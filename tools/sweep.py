@@ -388,7 +388,10 @@ class Sweep:
         for scene in self.planned:
             settings = settings_of(results, scene.name, self.plan)
             biases = find_biases(results, scene, self.plan)
-            costs = measure_all(scene, self.methods, self.folder, self.console.print) if with_costs else {}
+            costs = {}
+            if with_costs:
+                features = {r.method: r.account["features"] for r in results.records if r.scene == scene.name}
+                costs = measure_all(scene, features, self.folder, self.console.print)
             found.append(Section(scene.name, settings, verdicts(settings), biases, costs))
         if len(found) > 1:
             settings = self._together(results)

@@ -9,7 +9,7 @@ import numpy as np
 from rich.table import Table
 
 from tools.frontier import DOMINATED, FALSE_ALARM_RATE, FRONTIER, OPEN, Setting
-from tools.knobs import KNOBS, SPP
+from tools.knobs import KNOBS, SPP, label
 from tools.results import Results
 from tools.summary import NOISY_REFERENCE, Figure, mean_figure, ratio_figure
 from tools.sweep import DEFAULT, Plan, Section, Sweep
@@ -97,7 +97,7 @@ def remarks(sections: list[Section], sweep: Sweep, results: Results) -> list[str
         lines.append("one run of each setting says nothing about dominance; --seeds 3 or more does")
     moved = {name: value for name, value in plan.unbiased.items() if value != plan.own[name]}
     if moved:
-        words = ", ".join(f"{name}={value}" for name, value in moved.items())
+        words = ", ".join(f"{name}={label(value)}" for name, value in moved.items())
         lines.append(f"errors are against the reference with {words}; what a setting leaves out is its bias")
     for scene in results.experiment.scenes:
         section = next(section for section in sections if section.name == scene.name)
@@ -218,7 +218,7 @@ def _plot_section(axis, section: Section, metric: str) -> None:
     for setting, verdict in zip(section.settings, section.verdicts, strict=True):
         seconds, errors = mean_figure(setting.seconds), mean_figure(setting.errors)
         color = PALETTE[kept.index(setting.method)] if setting.method in kept else "#aaaaaa"
-        label = setting.method if setting.method in kept else "other settings"
+        called = setting.method if setting.method in kept else "other settings"
         # Logarithmic axes have no room for an end below zero.
         bars = [np.nan_to_num([[min(f.mean - f.low, 0.9 * f.mean)], [f.high - f.mean]]) for f in (seconds, errors)]
         axis.errorbar(
@@ -231,10 +231,10 @@ def _plot_section(axis, section: Section, metric: str) -> None:
             elinewidth=0.7,
             color=color,
             alpha=0.4 if verdict.kind == DOMINATED else 1.0,
-            label=None if label in named else label,
+            label=None if called in named else called,
             zorder=3 if verdict.kind == FRONTIER else 2,
         )
-        named.add(label)
+        named.add(called)
     axis.set(xscale="log", yscale="log", xlabel="time, s", ylabel=metric, title=section.name)
     axis.grid(True, which="both", linewidth=0.3)
     axis.legend(fontsize=7, title="circle: frontier, square: not separated, cross: dominated", title_fontsize=7)
