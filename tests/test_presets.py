@@ -136,7 +136,7 @@ def test_check_of_presets(tmp_path, monkeypatch, capsys):
     assert [scene["file"] for scene in origin["scenes"]] == ["scenes/cornell-box.json"]
     assert origin["runs"] == 4
     assert origin["all_scenes"]["verdict"] != DOMINATED
-    setting = {"setting", "biased", "seconds", "error"}
+    setting = {"setting", "seconds", "error"}
     assert origin["frontier"] and all(set(one) == setting for one in origin["frontier"])
     # What has been measured is there. A preset without light samples is far behind one with them and with less time.
     slow = ({"integrator.spp": 128, "integrator.nee": False}, [])

@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from tools.bench_common import ROOT
-from tools.frontier import DOMINATED, FRONTIER, Setting, Verdict, verdicts
+from tools.frontier import DOMINATED, FRONTIER, Setting, Verdict
 from tools.knobs import KNOBS, SPP, UNRESTRICTED_DEPTH
 from tools.reference import available_cores
 from tools.results import Results, write_json
@@ -103,7 +103,7 @@ class Checked:
 
 
 def check(presets: list[Preset], sweep: Sweep, sections: list[Section]) -> list[Checked]:
-    """Compares every preset with the settings beside it."""
+    """Finds every preset among the settings."""
     found = []
     for preset in presets:
         spp, changes = changes_of(preset)
@@ -112,10 +112,9 @@ def check(presets: list[Preset], sweep: Sweep, sections: list[Section]) -> list[
         key = (method_name(ordered), spp)
 
         def verdict_in(section: Section, preset=preset, key=key) -> tuple[Setting, Verdict]:
-            # One that may be biased is compared with all; any other with those that are not.
-            rivals = [s for s in section.settings if preset.biased_by or not sweep.is_biased(s.method)]
-            at = next(i for i, s in enumerate(rivals) if (s.method, s.budget.spp) == key)
-            return rivals[at], verdicts(rivals)[at]
+            # One that may be biased is compared with all, any other with those that are not.
+            at = next(i for i, s in enumerate(section.settings) if (s.method, s.budget.spp) == key)
+            return section.settings[at], (section.verdicts if preset.biased_by else section.among_unbiased)[at]
 
         setting, verdict = verdict_in(sections[-1])
         found.append(Checked(preset, setting, verdict, {s.name: verdict_in(s)[1] for s in of_scenes(sections)}))
@@ -157,8 +156,9 @@ def origin(checked: Checked, sections: list[Section], files: list[str], sweep: S
         bias = section.biases.get(setting.method)
         entry = {"file": file, **figures(setting), "bias": bias and bias.plain()}
         measured.append({**rounded(entry), "verdict": checked.of_each[section.name].kind})
-    pairs = zip(together.settings, together.verdicts, strict=True)
-    frontier = sorted((s for s, v in pairs if v.kind == FRONTIER), key=lambda s: np.mean(s.seconds))
+    kinds = together.verdicts if checked.preset.biased_by else together.among_unbiased
+    pairs = zip(together.settings, kinds, strict=True)
+    frontier = sorted((s for s, v in pairs if v and v.kind == FRONTIER), key=lambda s: np.mean(s.seconds))
     return {
         "commit": experiment.commit,
         "date": experiment.date,
@@ -171,7 +171,6 @@ def origin(checked: Checked, sections: list[Section], files: list[str], sweep: S
         "frontier": [
             {
                 "setting": s.name,
-                "biased": sweep.is_biased(s.method),
                 "seconds": rounded(float(np.mean(s.seconds))),
                 "error": rounded(float(np.mean(s.errors))),
             }

@@ -1,11 +1,11 @@
 """The sweep behind `tools.trade`: which settings are measured, and what was found of them.
 
 A sweep is an experiment (`tools.experiment`) whose methods are settings of knobs. It begins with the scene's own
-settings and every other value of every knob, one at a time. Each further round joins in pairs what is on the frontier
-of the means so far: methods of which some budget is on it, unless both turn a knob to different values. A sweep that
-is killed goes on where it was: the rounds follow from the records.
+settings and every other value of every knob, one at a time. Each further round joins in pairs the methods of which some
+budget is on the frontier of the means so far, or on that of the methods without bias, unless both turn a knob to
+different values. A sweep that is killed goes on where it was: the rounds follow from the records.
 
-After the last round, methods that are on the frontier at the largest number of samples may go on with more
+After the last round, methods that are on either frontier at the largest number of samples may go on with more
 (`Plan.more`), which saves what the others would take.
 
 Budgets in samples share runs: the image of a run at a power of two of its samples is to the last bit that of a run
@@ -36,6 +36,7 @@ from wavefront.errors import SceneError, WavefrontError
 from wavefront.scene.json_format import with_overrides
 
 DEFAULT = "default"  # the method that turns no knob
+TOGETHER = "all scenes"
 
 Changes = dict[str, Value]  # by knob, values other than the scene's own
 
@@ -226,7 +227,9 @@ class Section:
     Attributes:
         name: Of the scene.
         settings: All of them.
-        verdicts: Of each.
+        verdicts: Of each, among all.
+        unbiased: Methods that make the reference's image.
+        among_unbiased: Of each setting, the verdict among those of these methods; None for others.
         biases: By method, the part of the error that is bias; None where it cannot be told. Empty for several scenes.
         costs: By method; empty for several scenes.
     """
@@ -234,6 +237,8 @@ class Section:
     name: str
     settings: list[Setting]
     verdicts: list[Verdict]
+    unbiased: set[str]
+    among_unbiased: list[Verdict | None]
     biases: dict[str, Figure | None]
     costs: dict[str, Cost]
 
@@ -321,7 +326,7 @@ class Sweep:
         extra = [changes for changes in self.extra if changes not in chosen]
         results = self._measure([*chosen, *extra], "all combinations" if whole else "one at a time")
         for number in range(0 if whole else rounds):
-            on_frontier = self._on_frontier(results, [method_name(changes) for changes in chosen])
+            on_frontier = self._on_frontiers(results, [method_name(changes) for changes in chosen])
             parents = [changes for changes in chosen if changes and method_name(changes) in on_frontier]
             new = joined_pairs(parents, chosen, list(self.plan.values))
             if not new:
@@ -330,7 +335,7 @@ class Sweep:
             extra = [changes for changes in self.extra if changes not in chosen]
             results = self._measure([*chosen, *extra], f"round {number + 1} of pairs from the frontier")
         if self.plan.more:
-            largest = self._on_frontier(results, [method_name(c) for c in chosen], self.plan.budgets[-1])
+            largest = self._on_frontiers(results, [method_name(c) for c in chosen], self.plan.budgets[-1])
             last = [changes for changes in chosen if method_name(changes) in largest or not changes]
             last += [changes for changes in self.extra if changes not in last]
             results = self._measure(last, f"{self.plan.more} spp", more=True)
@@ -340,16 +345,25 @@ class Sweep:
         """Whether a method makes another image than the reference's, of a scene or of any."""
         return any(planned.notes[method] for planned in self.planned if scene in (None, planned.name))
 
-    def _on_frontier(self, results: Results, methods: Sequence[str], budget: Budget | None = None) -> set[str]:
-        """Methods with a setting on the frontier of the means, of all scenes together and of these methods alone, with
-        this budget or any."""
+    def _on_frontiers(self, results: Results, methods: Sequence[str], budget: Budget | None = None) -> set[str]:
+        """Methods with a setting on a frontier of the means, of all scenes together: that of these methods alone, and
+        that of those among them without bias.
+
+        Args:
+            results: So far.
+            methods: That are compared.
+            budget: Only settings with this one; None: with any.
+        """
         settings = [
             setting
             for setting in self._together(results)
             if setting.method in methods and budget in (None, setting.budget)
         ]
-        kept = pareto([np.mean(s.seconds) for s in settings], [np.mean(s.errors) for s in settings])
-        return {setting.method for setting, on in zip(settings, kept, strict=True) if on}
+        found = set()
+        for some in (settings, [setting for setting in settings if not self.is_biased(setting.method)]):
+            kept = pareto([np.mean(s.seconds) for s in some], [np.mean(s.errors) for s in some])
+            found |= {setting.method for setting, on in zip(some, kept, strict=True) if on}
+        return found
 
     def _together(self, results: Results) -> list[Setting]:
         return joined([settings_of(results, scene.name, self.plan) for scene in self.plan.scenes])
@@ -392,8 +406,13 @@ class Sweep:
             if with_costs:
                 features = {r.method: r.account["features"] for r in results.records if r.scene == scene.name}
                 costs = measure_all(scene, features, self.folder, self.console.print)
-            found.append(Section(scene.name, settings, verdicts(settings), biases, costs))
+            found.append(self._section(scene.name, settings, biases, costs))
         if len(found) > 1:
-            settings = self._together(results)
-            found.append(Section("all scenes", settings, verdicts(settings), {}, {}))
+            found.append(self._section(None, self._together(results), {}, {}))
         return found
+
+    def _section(self, scene: str | None, settings: list[Setting], biases: dict, costs: dict) -> Section:
+        unbiased = {method for method in self.methods if not self.is_biased(method, scene)}
+        among = iter(verdicts([setting for setting in settings if setting.method in unbiased]))
+        among_unbiased = [next(among) if setting.method in unbiased else None for setting in settings]
+        return Section(scene or TOGETHER, settings, verdicts(settings), unbiased, among_unbiased, biases, costs)

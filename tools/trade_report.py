@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from rich.table import Table
 
-from tools.frontier import DOMINATED, FALSE_ALARM_RATE, FRONTIER, OPEN, Setting
+from tools.frontier import DOMINATED, FALSE_ALARM_RATE, FRONTIER, OPEN, Setting, Verdict
 from tools.knobs import KNOBS, SPP, label
 from tools.results import Results
 from tools.summary import NOISY_REFERENCE, Figure, mean_figure, ratio_figure
@@ -36,24 +37,37 @@ def bias_words(bias: Figure | None) -> str:
 
 
 def frontier_table(section: Section, metric: str) -> Table:
-    """The settings on the frontier, by time."""
-    table = Table(title=f"{section.name}: the frontier", title_justify="left")
+    """The settings on the frontier, by time; and those on the frontier of the settings without bias, with a mark."""
+    table = Table(title=f"{section.name}: the frontier, and * that without bias", title_justify="left")
     table.add_column("setting")
     columns = ["time, s (95 % interval)", f"{metric} (95 % interval)"] + ["of it bias"] * bool(section.biases)
     for name in columns:
         table.add_column(name, justify="right")
-    for setting in _frontier(section):
+    table.add_column("")
+    either = {s.name: s for s in [*frontier(section), *unbiased_frontier(section)]}
+    without = {s.name for s in unbiased_frontier(section)}
+    for setting in sorted(either.values(), key=lambda setting: np.mean(setting.seconds)):
         row = [setting.name, str(mean_figure(setting.seconds)), str(mean_figure(setting.errors))]
         if section.biases:
             share = bias_share(section, setting)
             row.append("?" if share is None else f"{100.0 * share:.0f} %")
-        table.add_row(*row)
+        table.add_row(*row, "*" if setting.name in without else "")
     return table
 
 
-def _frontier(section: Section) -> list[Setting]:
-    kept = [s for s, verdict in zip(section.settings, section.verdicts, strict=True) if verdict.kind == FRONTIER]
+def _frontier(settings: Sequence[Setting], kinds: Sequence[Verdict | None]) -> list[Setting]:
+    kept = [s for s, verdict in zip(settings, kinds, strict=True) if verdict and verdict.kind == FRONTIER]
     return sorted(kept, key=lambda setting: np.mean(setting.seconds))
+
+
+def frontier(section: Section) -> list[Setting]:
+    """The settings on the frontier, by time."""
+    return _frontier(section.settings, section.verdicts)
+
+
+def unbiased_frontier(section: Section) -> list[Setting]:
+    """Those on the frontier of the settings without bias."""
+    return _frontier(section.settings, section.among_unbiased)
 
 
 def methods_table(section: Section, plan: Plan) -> Table:
@@ -147,7 +161,8 @@ def account(sections: list[Section], sweep: Sweep, results: Results) -> dict:
 
 def _section(section: Section, sweep: Sweep) -> dict:
     settings = []
-    for setting, verdict in zip(section.settings, section.verdicts, strict=True):
+    kinds = zip(section.settings, section.verdicts, section.among_unbiased, strict=True)
+    for setting, verdict, among_unbiased in kinds:
         bias, cost = section.biases.get(setting.method), section.costs.get(setting.method)
         settings.append(
             {
@@ -162,9 +177,16 @@ def _section(section: Section, sweep: Sweep) -> dict:
                 "peak_memory_bytes": cost and cost.peak_memory_bytes,
                 "verdict": verdict.kind,
                 "dominated_by": verdict.by,
+                "among_unbiased": among_unbiased
+                and {"verdict": among_unbiased.kind, "dominated_by": among_unbiased.by},
             }
         )
-    return {"name": section.name, "settings": settings, "frontier": [setting.name for setting in _frontier(section)]}
+    return {
+        "name": section.name,
+        "settings": settings,
+        "frontier": [setting.name for setting in frontier(section)],
+        "frontier_without_bias": [setting.name for setting in unbiased_frontier(section)],
+    }
 
 
 # --- plot --------------------------------------------------------------------------------------------------------
@@ -203,17 +225,12 @@ def plot(sections: list[Section], metric: str, path: Path) -> None:
 
 
 def _plot_section(axis, section: Section, metric: str) -> None:
-    frontier = _frontier(section)
-    axis.plot(
-        [np.mean(s.seconds) for s in frontier],
-        [np.mean(s.errors) for s in frontier],
-        color="black",
-        linewidth=1.0,
-        zorder=1,
-        label="frontier",
-    )
+    best, unbiased = frontier(section), unbiased_frontier(section)
+    for settings, style, words in ((best, "-", "frontier"), (unbiased, ":", "frontier without bias")):
+        seconds, errors = ([np.mean(getattr(s, name)) for s in settings] for name in ("seconds", "errors"))
+        axis.plot(seconds, errors, color="black", linewidth=1.0, linestyle=style, zorder=1, label=words)
     # Methods with most of the frontier get a colour of their own.
-    kept = [method for method, _ in Counter(s.method for s in frontier).most_common(len(PALETTE))]
+    kept = [method for method, _ in Counter(s.method for s in [*best, *unbiased]).most_common(len(PALETTE))]
     named = set()
     for setting, verdict in zip(section.settings, section.verdicts, strict=True):
         seconds, errors = mean_figure(setting.seconds), mean_figure(setting.errors)
