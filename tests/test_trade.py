@@ -18,7 +18,7 @@ from tools.experiment_spec import MethodSpec, ReferenceSpec, SceneSpec, Spec
 from tools.experiment_spec import plan as plan_experiment
 from tools.knobs import KNOBS, TRADES, UNRESTRICTED_DEPTH, Knob, label, parse_knob
 from tools.methods import load_job
-from tools.reference_store import Reference, target_records
+from tools.reference_store import target_records
 from tools.results import Budget, load_results, read_records
 from tools.setting_cost import Cost
 from tools.sweep import joined_pairs, make_plan, method_name, one_at_a_time
@@ -221,14 +221,15 @@ def test_what_a_sweep_finds(swept):
 
 
 def test_points_of_a_run_are_runs(swept):
-    """What is taken for a run of 2 samples is what such a run gives."""
-    results = load_results(swept)
-    record = next(r for r in results.records if r.method == "default" and r.budget.spp == 32)
-    job = load_job(CORNELL_BOX, SMALL, None, 1)
-    reference = results.reference("cornell-box")
-    assert isinstance(reference, Reference)
-    _, _, points = run_once("wavefront", job, record.renderer_seed, Budget(spp=2), reference, ["relmse"], None)
-    assert points[-1].errors == next(point for point in record.points if point.samples == 2).errors
+    """What is taken for runs of 2 samples is what such runs give."""
+    results, plan = load_results(swept), plan_of(sizes=(2, 32), more=64)
+    settings = {s.name: s for s in sweep.settings_of(results, "cornell-box", plan)}
+    records = [r for r in results.records if (r.method, r.budget.spp) == ("default", 32)]
+    assert settings["default, 32 spp"].errors == tuple(record.errors["relmse"] for record in records)
+    job, reference = load_job(CORNELL_BOX, SMALL, None, 1), results.reference("cornell-box")
+    for record, error in zip(records, settings["default, 2 spp"].errors, strict=True):
+        _, _, points = run_once("wavefront", job, record.renderer_seed, Budget(spp=2), reference, ["relmse"], None)
+        assert points[-1].errors == {"relmse": error}
 
 
 def test_resumes_after_a_kill(swept, tmp_path, monkeypatch):

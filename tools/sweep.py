@@ -5,8 +5,8 @@ settings and every other value of every knob, one at a time. Each further round 
 budget is on the frontier of the means so far, or on that of the methods without bias, unless both turn a knob to
 different values. A sweep that is killed goes on where it was: the rounds follow from the records.
 
-After the last round, methods that are on either frontier at the largest number of samples may go on with more
-(`Plan.more`), which saves what the others would take.
+After the last round, the methods that are on the frontier without bias at the largest number of samples may go on with
+more (`Plan.more`). The others would take most of the time: more samples remove no bias.
 
 Budgets in samples share runs: the image of a run at a power of two of its samples is to the last bit that of a run
 with so many, so that one run of the largest number measures all. Where a knob trains, each number has runs of its own.
@@ -52,7 +52,8 @@ class Plan:
         unbiased: By knob, the value of the references.
         budgets: Largest last.
         sizes: Samples per pixel that are settings; empty if budgets are seconds.
-        more: Samples per pixel for those alone that are on the frontier at the largest of `sizes`; None: no more.
+        more: Samples per pixel for those alone that are on the frontier without bias at the largest of `sizes`; None: no
+            more.
         seeds: Of the runs.
         metric: Of `tools.metrics`.
         reference: How references are made.
@@ -335,8 +336,9 @@ class Sweep:
             extra = [changes for changes in self.extra if changes not in chosen]
             results = self._measure([*chosen, *extra], f"round {number + 1} of pairs from the frontier")
         if self.plan.more:
-            largest = self._on_frontiers(results, [method_name(c) for c in chosen], self.plan.budgets[-1])
-            last = [changes for changes in chosen if method_name(changes) in largest or not changes]
+            unbiased = [name for name in self.methods if not self.is_biased(name)]
+            largest = self._on_frontiers(results, unbiased, self.plan.budgets[-1])
+            last = [changes for changes in chosen if method_name(changes) in largest]
             last += [changes for changes in self.extra if changes not in last]
             results = self._measure(last, f"{self.plan.more} spp", more=True)
         return results

@@ -82,7 +82,10 @@ def build_parser() -> argparse.ArgumentParser:
     budget.add_argument("--spp", metavar="N,N,...", help=f"default {','.join(map(str, KNOBS[SPP].values))}")
     budget.add_argument("--seconds", metavar="S,S,...", help="of rendering, instead of samples")
     parser.add_argument(
-        "--more-spp", type=int, metavar="N", help="for those alone that are on the frontier at the largest of --spp"
+        "--more-spp",
+        type=int,
+        metavar="N",
+        help="for those alone that are on the frontier without bias at the largest of --spp",
     )
     parser.add_argument("--seeds", type=int, default=5, metavar="N", help="runs of each setting; default 5")
     parser.add_argument("--metric", metavar="NAME", help=f"default {DEFAULT_METRIC}")

@@ -76,7 +76,7 @@ def methods_table(section: Section, plan: Plan) -> Table:
     table = Table(title=f"{section.name}: at {budget.label}, over {DEFAULT}", title_justify="left")
     table.add_column("method")
     columns = ["time (95 % interval)", f"{plan.metric} (95 % interval)"]
-    columns += [f"{plan.metric} that is bias"] * bool(section.biases)
+    columns += [f"bias of {plan.metric}"] * bool(section.biases)
     columns += ["compile, s", "memory, MiB"] * bool(section.costs)
     for name in [*columns, FRONTIER, OPEN, DOMINATED]:
         table.add_column(name, justify="right")
@@ -215,7 +215,7 @@ def plot(sections: list[Section], metric: str, path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as Canvas
 
-    canvas = Canvas(figsize=(7.0 * len(sections), 5.0), layout="constrained")
+    canvas = Canvas(figsize=(9.0 * len(sections), 5.0), layout="constrained")
     FigureCanvasAgg(canvas)
     axes = canvas.subplots(1, len(sections), squeeze=False)[0]
     for axis, section in zip(axes, sections, strict=True):
@@ -254,4 +254,5 @@ def _plot_section(axis, section: Section, metric: str) -> None:
         named.add(called)
     axis.set(xscale="log", yscale="log", xlabel="time, s", ylabel=metric, title=section.name)
     axis.grid(True, which="both", linewidth=0.3)
-    axis.legend(fontsize=7, title="circle: frontier, square: not separated, cross: dominated", title_fontsize=7)
+    title = "circle: on the frontier\nsquare: not separated\ncross: dominated"
+    axis.legend(fontsize=7, title=title, title_fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
