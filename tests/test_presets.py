@@ -142,6 +142,9 @@ def test_check_of_presets(tmp_path, monkeypatch, capsys):
     slow = ({"integrator.spp": 128, "integrator.nee": False}, [])
     assert check(tmp_path, monkeypatch, reference=slow) == 1
     assert "reference is dominated by " in capsys.readouterr().out
+    # One that claims to have no bias.
+    assert check(tmp_path, monkeypatch, draft=(SETTINGS["draft"][0], [])) == 2
+    assert "draft.json: biased_by is empty; cornell-box finds a bias" in capsys.readouterr().err
 
 
 def test_a_preset_that_is_no_knob(tmp_path, monkeypatch, capsys):

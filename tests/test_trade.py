@@ -199,7 +199,8 @@ def test_what_a_sweep_finds(swept):
     found = json.loads((swept / "trade.json").read_text())
     (section,) = found["sections"]
     settings = {setting["name"]: setting for setting in section["settings"]}
-    assert {"default, 2 spp", "default, 32 spp", "default, 64 spp", "max_depth=2, 2 spp"} <= set(settings)
+    assert {"default, 2 spp", "default, 32 spp", "max_depth=2, 2 spp", "max_depth=64, 64 spp"} <= set(settings)
+    assert not {"default, 64 spp", "max_depth=2, 64 spp"} & set(settings)  # they have a bias
     assert [knob["name"] for knob in found["knobs"]] == ["max_depth", "nee", "spp"]
     assert (swept / "frontier.png").read_bytes().startswith(b"\x89PNG")
     for setting in settings.values():

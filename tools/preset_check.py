@@ -27,7 +27,7 @@ from tools.knobs import KNOBS, SPP, UNRESTRICTED_DEPTH
 from tools.reference import available_cores
 from tools.results import Results, write_json
 from tools.summary import mean_figure
-from tools.sweep import Changes, Section, Sweep, make_plan, method_name
+from tools.sweep import Changes, Plan, Section, Sweep, make_plan, method_name, same
 from wavefront.errors import WavefrontError
 from wavefront.presets import NAMES, Preset, load_preset, preset_path
 
@@ -102,22 +102,29 @@ class Checked:
     of_each: dict[str, Verdict]
 
 
+def turned(changes: Changes, plan: Plan) -> Changes:
+    """Of these changes those that differ from the scenes' own settings, in the order of names of methods."""
+    return {name: changes[name] for name in plan.values if name in changes and not same(changes[name], plan.own[name])}
+
+
 def check(presets: list[Preset], sweep: Sweep, sections: list[Section]) -> list[Checked]:
-    """Finds every preset among the settings."""
+    """Finds every preset among the settings: one that may be biased among all, any other among those without bias.
+
+    Raises:
+        WavefrontError: A preset has a bias that it does not name.
+    """
     found = []
     for preset in presets:
         spp, changes = changes_of(preset)
-        changes = {k: v for k, v in changes.items() if v != sweep.plan.own[k]}
-        ordered = {name: changes[name] for name in sweep.plan.values if name in changes}
-        key = (method_name(ordered), spp)
-
-        def verdict_in(section: Section, preset=preset, key=key) -> tuple[Setting, Verdict]:
-            # One that may be biased is compared with all, any other with those that are not.
-            at = next(i for i, s in enumerate(section.settings) if (s.method, s.budget.spp) == key)
-            return section.settings[at], (section.verdicts if preset.biased_by else section.among_unbiased)[at]
-
-        setting, verdict = verdict_in(sections[-1])
-        found.append(Checked(preset, setting, verdict, {s.name: verdict_in(s)[1] for s in of_scenes(sections)}))
+        key, places = (method_name(turned(changes, sweep.plan)), spp), {}
+        for section in [*of_scenes(sections), sections[-1]]:
+            at = [(setting.method, setting.budget.spp) for setting in section.settings].index(key)
+            verdict = (section.verdicts if preset.biased_by else section.among_unbiased)[at]
+            if verdict is None:
+                raise WavefrontError(f"{preset_path(preset.name)}: biased_by is empty; {section.name} finds a bias")
+            places[section.name] = section.settings[at], verdict
+        setting, verdict = places[sections[-1].name]
+        found.append(Checked(preset, setting, verdict, {s.name: places[s.name][1] for s in of_scenes(sections)}))
     return found
 
 
@@ -208,10 +215,6 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
         more=most,
     )
     folder = arguments.output or Path("results") / "presets"
-    extra = []
-    for _, changes in wanted:
-        turned = {name: changes[name] for name in plan.values if name in changes and changes[name] != plan.own[name]}
-        extra += [turned] if turned else []
     sweep = Sweep(
         plan,
         "presets",
@@ -220,7 +223,7 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
         arguments.threads or available_cores(),
         arguments.device,
         console,
-        extra,
+        [turned(changes, plan) for _, changes in wanted],
     )
     results = sweep.go(arguments.rounds)
     sections = sweep.sections(results, with_costs=False)

@@ -52,8 +52,7 @@ class Plan:
         unbiased: By knob, the value of the references.
         budgets: Largest last.
         sizes: Samples per pixel that are settings; empty if budgets are seconds.
-        more: Samples per pixel for those alone that are on the frontier without bias at the largest of `sizes`; None: no
-            more.
+        more: Samples per pixel for those alone that are on the frontier without bias at the largest of `sizes`.
         seeds: Of the runs.
         metric: Of `tools.metrics`.
         reference: How references are made.
