@@ -111,6 +111,11 @@ def test_scenes_start_from_the_same():
         plan_of(paths=[CORNELL_BOX, ROOT / "scenes" / "glossy-plates.json"], overrides=[])
 
 
+def test_scenes_have_names_of_their_own():
+    with pytest.raises(WavefrontError, match="another scene is called cornell-box too"):
+        plan_of(paths=[CORNELL_BOX, CORNELL_BOX])
+
+
 def test_pairs_by_hand():
     order = ["a", "b", "c"]
     there = [{}, {"a": 1}, {"a": 2}, {"b": 1}, {"a": 2, "b": 1}]

@@ -141,12 +141,15 @@ def make_plan(
             for job in jobs:
                 _check_value(knob, value, job)
         values[name] = tuple(every)
-    start = [text for name in knobs if not same(own[name], unbiased[name]) for text in
-             KNOBS[name].overrides(unbiased[name])]  # fmt: skip
-    scenes = []
+    changed = [name for name in knobs if not same(own[name], unbiased[name])]
+    start = [text for name in changed for text in KNOBS[name].overrides(unbiased[name])]
+    scenes: list[SceneSpec] = []
     for job in jobs:
-        sampler = getattr(job.scene.integrator, "sampler", "independent")
-        independent = ["integrator.sampler=independent"] if sampler != "independent" else []
+        if scene_name(job.path) in [scene.name for scene in scenes]:
+            raise WavefrontError(
+                f"{job.path}: another scene is called {scene_name(job.path)} too; allowed: different names"
+            )
+        independent = ["integrator.sampler=independent"] if job.scene.integrator.sampler != "independent" else []
         scenes.append(
             SceneSpec(
                 file=str(job.path.resolve()),
