@@ -260,7 +260,9 @@ def settings_of(results: Results, scene: str, plan: Plan) -> list[Setting]:
                 seconds = tuple(record.seconds.render for record in records)
                 found.append(Setting(method, budget, seconds, tuple(r.errors[plan.metric] for r in records)))
             continue
-        for size in [*plan.sizes, *([plan.more] if Budget(spp=plan.more) in by_budget else [])]:
+        # Runs with more samples may be left of an earlier sweep that was stopped; some of the seeds are no setting.
+        went_on = len(by_budget.get(Budget(spp=plan.more), ())) == len(plan.seeds)
+        for size in [*plan.sizes, *([plan.more] if went_on else [])]:
             budget = Budget(spp=size)
             records = by_budget.get(budget, by_budget[plan.budgets[-1]])
             points = [next(point for point in record.points if point.samples == size) for record in records]
