@@ -146,6 +146,7 @@ def test_scenes_are_joined_by_geometric_means():
     budget = Budget(spp=4)
     one = [Setting("a", budget, (1.0, 4.0), (0.1, 0.4)), Setting("b", budget, (3.0, 3.0), (1.0, 1.0))]
     two = [Setting("b", budget, (12.0, 3.0), (4.0, 9.0)), Setting("a", budget, (4.0, 9.0), (0.4, 0.1))]
+    one.append(Setting("c", budget, (1.0, 1.0), (1.0, 1.0)))  # not in the other
     a, b = joined([one, two])
     assert (a.method, b.method) == ("a", "b")
     np.testing.assert_allclose(a.seconds, (2.0, 6.0))

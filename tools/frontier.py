@@ -151,7 +151,7 @@ def joined(scenes: Sequence[Sequence[Setting]]) -> list[Setting]:
     """The settings of several scenes as one: times and errors are geometric means over the scenes, seed by seed.
 
     Args:
-        scenes: Of each, the same settings.
+        scenes: Of each, its settings; those that not all have are left out.
     """
     by_key = [{(setting.method, setting.budget): setting for setting in settings} for settings in scenes]
 
@@ -165,6 +165,7 @@ def joined(scenes: Sequence[Sequence[Setting]]) -> list[Setting]:
             mean([settings[key].errors for settings in by_key]),
         )
         for key in by_key[0]
+        if all(key in settings for settings in by_key)
     ]
 
 
