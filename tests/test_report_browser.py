@@ -7,6 +7,7 @@ Needs the package playwright (of the extra ``test``) and a Chromium: Debian's, C
 from __future__ import annotations
 
 import base64
+import contextlib
 import os
 import shutil
 
@@ -98,22 +99,28 @@ class Viewer:
         return self.page.locator("#stage canvas").nth(pane).bounding_box()
 
 
-@pytest.fixture
-def viewer(browser, folder):
-    """A page that was just opened from the disk, without a network; then, nothing was fetched or complained of."""
-    context = browser.new_context(viewport={"width": 1100, "height": 800}, offline=True)
+@contextlib.contextmanager
+def opened(browser, path, **options):
+    """A page that is opened from the disk, without a network; at the end, nothing was fetched or complained of."""
+    context = browser.new_context(viewport={"width": 1100, "height": 800}, offline=True, **options)
     page = context.new_page()
-    address, requests, complaints = (folder / "report.html").as_uri(), [], []
+    address, requests, complaints = path.as_uri(), [], []
     page.on("request", lambda request: requests.append(request.url))
     page.on("console", lambda message: complaints.append(message.text))
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.goto(address)
-    made = Viewer(page)
-    page.locator("#stage").focus()
-    yield made.wait()
+    yield page
     assert requests == [address]
     assert complaints == []
     context.close()
+
+
+@pytest.fixture
+def viewer(browser, folder):
+    """The viewer of `folder`, with the focus."""
+    with opened(browser, folder / "report.html") as page:
+        page.locator("#stage").focus()
+        yield Viewer(page).wait()
 
 
 def stored(name: str, scene: str = "room") -> np.ndarray:
@@ -384,13 +391,33 @@ def test_schemes_and_narrow_windows(viewer, scheme):
 
 
 def test_devices_with_more_pixels(browser, folder):
-    context = browser.new_context(viewport={"width": 900, "height": 700}, device_scale_factor=2)
-    page = context.new_page()
-    page.goto((folder / "report.html").as_uri())
-    viewer = Viewer(page).wait()
-    assert viewer.pixels().shape[1] == round(2 * viewer.box()["width"])
-    assert_shown(viewer, tone_map(stored("slow 16")))
-    context.close()
+    with opened(browser, folder / "report.html", device_scale_factor=2) as page:
+        viewer = Viewer(page).wait()
+        assert viewer.pixels().shape[1] == round(2 * viewer.box()["width"])
+        assert_shown(viewer, tone_map(stored("slow 16")))
+
+
+def test_pages_of_other_results(browser, tmp_path):
+    """Names that are HTML are text, and without images there is no viewer, and no error either."""
+    evil = '</script><img src=x onerror="throw 1">&amp;'
+    made = write_results(tmp_path / "evil", {evil: (6, 5)}, ("slow", evil), description=evil)
+    assert report.main([str(made)]) == 0
+    with opened(browser, made / "report.html") as page:
+        viewer = Viewer(page).wait()
+        assert page.locator("img").count() == 0
+        assert viewer.text("#choices button >> nth=2") == f"2{evil}"
+        assert (
+            viewer.text("#scenes button")
+            == viewer.text(".plots:visible h3")
+            == viewer.text("header p >> nth=0")
+            == evil
+        )
+    assert report.main([str(made), "--images", "none"]) == 0
+    with opened(browser, made / "report.html") as page:
+        page.locator("#metric").select_option("mae")
+        page.keyboard.press("w")
+        assert page.locator("table.results:visible").count() == 1
+        assert not page.locator("#viewer").is_visible()
 
 
 def test_results_are_those_that_were_written(folder):

@@ -110,7 +110,7 @@ def make_page(
         setup=_setup(results),
         footer=_footer(bool(scenes), images),
         style=_part("report.css"),
-        script=_part("pixels.js") + "\n" + _part("viewer.js"),
+        script="\n".join(map(_part, ("pixels.js", "viewer.js", "controls.js"))),
         # In a script element, only "<" could end it.
         data=msgspec.json.encode(data).decode("utf-8").replace("<", "\\u003c"),
         pixels="\n".join(pixels.elements),
@@ -201,7 +201,7 @@ def _scene_data(
 def table(results: Results, cells: Sequence[Cell], metric: str, hidden: bool = False) -> str:
     """The summary by one metric; attributes ``data-value`` have all digits."""
     baseline = results.experiment.baseline
-    heads = ["method", "runs", METRICS[metric].label, "95 %", "time, s", "95 %", "spp", "efficiency"]
+    heads = ["method", "runs", METRICS[metric].label, "95 %", "time,\u00a0s", "95 %", "spp", "efficiency"]
     heads += [f"speed-up over {baseline}", "95 %"] if baseline else []
     rows, before = [], None
     for cell in cells:
