@@ -25,7 +25,8 @@ from wavefront.light.sampling import make_light_sampler
 from wavefront.light.tables import KIND_CONSTANT, LightTables
 from wavefront.light.tables import KINDS as LIGHT_KINDS
 from wavefront.renderer import Renderer
-from wavefront.rng import PURPOSE_BSDF, PURPOSE_CAMERA, PURPOSE_LIGHT, uniform4
+from wavefront.rng import PURPOSE_BSDF, PURPOSE_CAMERA, PURPOSE_LIGHT
+from wavefront.sampler import SAMPLERS
 from wavefront.surface import make_vertex, spawn_origin
 from wavefront.texture import TextureTables, make_eval_parameter
 from wavefront.warp_samples import square_to_gaussian, square_to_tent
@@ -73,6 +74,7 @@ def make_megakernel(
     nee: bool,
     instances: tuple[str, ...],
     envmap: str,
+    sampler: str,
 ):
     """Only what a scene lacks memory for is left out: kinds of primitive, vertex normals, UVs, tables of sampling."""
     perspective, thin_lens, orthographic = (make_camera_ray(kind) for kind in CAMERAS)
@@ -85,6 +87,7 @@ def make_megakernel(
     eval_envmap, _ = make_envmap(envmap, nee)
     envmap_kind = wp.constant(LIGHT_KINDS[f"envmap_{envmap}"])
     eval_parameter = make_eval_parameter(TEXTURES)
+    draw = SAMPLERS[sampler]
 
     @wp.kernel(enable_backward=False, module="unique")
     def trace_paths(
@@ -103,7 +106,7 @@ def make_megakernel(
         sample = wp.uint32(settings.first_sample + i % settings.samples)
         seed = settings.seed
 
-        u = uniform4(seed, key, sample, 0, PURPOSE_CAMERA)
+        u = draw(seed, key, sample, 0, PURPOSE_CAMERA)
         shift = wp.vec2(u[0], u[1]) - wp.vec2(0.5, 0.5)
         if settings.filter == TENT:
             shift = settings.filter_scale * square_to_tent(wp.vec2(u[0], u[1]))
@@ -186,7 +189,7 @@ def make_megakernel(
                 frame = mapped_frame(materials, textures, shape.material, vertex, wo)
             facing = is_smooth(materials.materials[shape.material], wp.dot(frame.normal, wo))
             if settings.nee == 1 and facing and lights.lights.shape[0] > 0:
-                u = uniform4(seed, key, sample, segment - 1, PURPOSE_LIGHT)
+                u = draw(seed, key, sample, segment - 1, PURPOSE_LIGHT)
                 light = sample_light(lights, geometry, textures, vertex.position, u)
                 if wp.max(light.L) > 0.0:
                     f = eval_bsdf(materials, textures, shape.material, vertex.uv, frame, wo, light.wi)
@@ -207,7 +210,7 @@ def make_megakernel(
                                 w = 1.0
                             L += (w / light.pdf) * wp.cw_mul(beta, wp.cw_mul(f.value, Ld))
 
-            u = uniform4(seed, key, sample, segment - 1, PURPOSE_BSDF)
+            u = draw(seed, key, sample, segment - 1, PURPOSE_BSDF)
             s = sample_bsdf(materials, textures, shape.material, vertex.uv, frame, wo, wp.vec3(u[0], u[1], u[2]))
             beta = wp.cw_mul(beta, s.weight)
             if not wp.max(beta) > 0.0:
@@ -245,7 +248,7 @@ def render_megakernel(renderer: Renderer, spp: int) -> np.ndarray:
     result = wp.zeros(n, dtype=wp.vec3, device="cpu")
     envmap = "halves" if "envmap_halves" in f.lights else "floats"
     kernel = make_megakernel(
-        f.triangles, f.spheres, f.smooth, f.uvs, f.tangents, bool(f.maps), f.nee, f.instances, envmap
+        f.triangles, f.spheres, f.smooth, f.uvs, f.tangents, bool(f.maps), f.nee, f.instances, envmap, f.sampler
     )
     d = device_scene
     inputs = [make_camera(scene.camera, film), d.geometry, d.materials, d.textures, d.lights, settings]

@@ -96,6 +96,21 @@ def test_the_second_half_gives_the_bits_of_the_whole(whole, checkpoint, argument
     assert r.statistics.render_seconds > 0.0 and r.statistics.stage_seconds["intersect"] > 0.0
 
 
+def test_a_sequence_of_samples_goes_on(tmp_path):
+    """Samples of a Sobol sequence belong together: those after the checkpoint are the next ones of it."""
+    whole, half = renderer("integrator.sampler=sobol"), renderer("integrator.sampler=sobol")
+    whole.render(SPP)
+    half.render(SPP // 2)
+    half.save_checkpoint(tmp_path / "half")
+    r = renderer("integrator.sampler=sobol", threads=2, memory=1 << 20)
+    r.load_checkpoint(tmp_path / "half")
+    r.render(SPP - SPP // 2)
+    assert_same(sums(r), sums(whole))
+    message = r'integrator.sampler is null, but "sobol" in the checkpoint'
+    with pytest.raises(CheckpointError, match=message):
+        renderer().load_checkpoint(tmp_path / "half")
+
+
 def test_numpy_reads_it_without_pickle(checkpoint):
     with open(checkpoint, "rb") as file, np.load(file, allow_pickle=False) as archive:
         about = json.loads(archive["about.json"])

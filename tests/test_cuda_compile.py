@@ -29,6 +29,7 @@ CORNELL_BOX = Features(
     light_textures=(),
     nee=True,
     roulette=True,
+    sampler="independent",
     camera="perspective",
     filter="box",
     aovs=(),
@@ -50,6 +51,7 @@ EVERYTHING = Features(
     light_textures=("bytes", "checkerboard", "floats", "halves", "shorts"),
     nee=True,
     roulette=True,
+    sampler="independent",
     camera="perspective",
     filter="gaussian",
     aovs=FIRST_HIT,
@@ -71,7 +73,7 @@ CHANGES = [
     {"bsdfs": ("conductor",), "roulette": False, "filter": "box"},
     {"bsdfs": ("principled",)},
     {"bsdfs": ("dielectric",), "aovs": ("albedo",), "variance": False},
-    {"camera": "thin_lens"},
+    {"camera": "thin_lens", "sampler": "sobol"},
     {"camera": "orthographic", "aovs": ("shape_index",)},
 ]
 
@@ -85,7 +87,7 @@ def inspectors(f: Features) -> list:
     """Modules of the kernels of a traced path."""
     kernels = [make_inspect_hit(f.triangles, f.spheres, f.instances)]
     if f.light_sampling:
-        kernels.append(make_inspect_light(f.lights, f.light_textures))
+        kernels.append(make_inspect_light(f.lights, f.light_textures, f.sampler))
     return [kernel.module for kernel in kernels]
 
 
@@ -107,6 +109,12 @@ def test_one_feature_set_compiles_for_cuda(tmp_path):
 
 def test_kernels_of_a_traced_path_compile_for_cuda(tmp_path):
     assert compile_modules(inspectors(CORNELL_BOX), 90, tmp_path) == built(tmp_path) == 2
+
+
+def test_kernels_that_draw_sobol_points_compile_for_cuda(tmp_path):
+    kernels = make_kernels(dataclasses.replace(CORNELL_BOX, sampler="sobol"))
+    modules = [kernel.module for kernel in (kernels.generate, kernels.direct, kernels.scatter)]
+    assert compile_modules(modules, 90, tmp_path) == built(tmp_path) == 3
 
 
 @pytest.mark.slow

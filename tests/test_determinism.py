@@ -15,8 +15,11 @@ SPP = 8
 
 
 def load(name="material-mask", width=61, height=47):
+    name, _, sampler = name.partition(", ")
+    sampler = sampler or "independent"
     # Sizes without common factors, so that tiles are cut off at the right and at the bottom.
-    return load_scene(SCENES / f"{name}.json", [f"film.width={width}", f"film.height={height}"])
+    overrides = [f"film.width={width}", f"film.height={height}", f"integrator.sampler={sampler}"]
+    return load_scene(SCENES / f"{name}.json", overrides)
 
 
 def film(r, spp=SPP):
@@ -25,7 +28,7 @@ def film(r, spp=SPP):
     return r.film.arrays.L.numpy()
 
 
-@pytest.fixture(scope="module", params=["cornell-box", "material-mask", "material-bump-map"])
+@pytest.fixture(scope="module", params=["cornell-box", "material-mask", "material-bump-map", "cornell-box, sobol"])
 def name(request):
     return request.param
 

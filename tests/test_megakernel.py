@@ -92,6 +92,11 @@ def test_own_scene(name):
     check(own(name))
 
 
+@pytest.mark.parametrize("name", ["cornell-box", "camera-thin-lens", "coloured-glass"])
+def test_sobol(name):
+    check(own(name, "integrator.sampler=sobol", "integrator.rr_depth=2"), spp=6)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", OTHERS)
 def test_own_scene_slow(name):

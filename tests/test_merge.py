@@ -99,6 +99,23 @@ def test_images_of_one_sample(renders, tmp_path):
     assert_joint(channels, [single.film, films[1]])
 
 
+def test_seeds_of_a_sequence_are_independent(renders, tmp_path, capsys):
+    """Renders by the Sobol sampler are combined like others, but not with others."""
+    films, files = [], []
+    for seed in (21, 22):
+        r = Renderer(load("integrator.sampler=sobol"), seed=seed, threads=1)
+        r.render(4)
+        files.append(tmp_path / f"{seed}.exr")
+        write_exr(files[-1], r.film.channels(), attributes=image_attributes(r))
+        films.append(r.film)
+    channels, _ = merged(tmp_path / "out.exr", *files)
+    assert_joint(channels, films)
+    capsys.readouterr()
+    text = refused(capsys, tmp_path, files[0], *paths(renders[0], 11), "-o", tmp_path / "none.exr")
+    assert f'integrator.sampler is null, but "sobol" in {files[0]}' in text
+    assert "the same samples twice" in refused(capsys, tmp_path, files[0], files[0], "-o", tmp_path / "none.exr")
+
+
 def test_merges_of_merges(renders, tmp_path):
     folder, films = renders
     merged(tmp_path / "pair.exr", *paths(folder, 11, 13))

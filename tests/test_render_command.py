@@ -112,11 +112,13 @@ def test_the_header_says_how_the_image_was_made(scene, tmp_path, capsys):
 def test_command_line_overrides_the_scene(scene, tmp_path, capsys):
     out = tmp_path / "out.exr"
     arguments = ("--size", "8x6", "--spp", 2, "--max-depth", 3, "--no-nee", "--no-rr", "--half", "--threads", 1)
+    arguments += ("--sampler", "sobol")
     assert run(capsys, scene, "-o", out, *arguments, "--set", "integrator.max_depth=2", "--quiet") == (0, "")
     account = json.loads(out.with_suffix(".json").read_text())
     integrator = account["settings"]["integrator"]
     assert (integrator["max_depth"], integrator["nee"], integrator["rr_depth"]) == (2, False, None)
     assert account["features"]["nee"] is False and account["features"]["roulette"] is False
+    assert integrator["sampler"] == account["features"]["sampler"] == "sobol"
     assert account["settings"]["threads"] == 1
     channels = read(out)
     assert channels["R"].shape == (6, 8) and channels["R"].dtype == np.float16

@@ -17,7 +17,14 @@ from wavefront.scene import description as d
 from wavefront.strict import NonFiniteError, first_pixel
 
 SCENES = Path(__file__).parent.parent / "scenes"
-NAMES = ["cornell-box", "glossy-plates", "glass-caustic", "material-mask", "material-diffuse-bitmap"]
+NAMES = [
+    "cornell-box",
+    "glossy-plates",
+    "glass-caustic",
+    "material-mask",
+    "material-diffuse-bitmap",
+    "cornell-box, sobol",
+]
 WIDTH, HEIGHT = 48, 37
 ENDS = {
     "the ray left the scene",
@@ -28,8 +35,10 @@ ENDS = {
 
 
 def load(name, *overrides):
+    name, _, sampler = name.partition(", ")
     size = [f"film.width={WIDTH}", f"film.height={HEIGHT}", "integrator.max_depth=5", "integrator.rr_depth=2"]
-    return load_scene(SCENES / f"{name}.json", [*size, *overrides])
+    sampler = f"integrator.sampler={sampler or 'independent'}"
+    return load_scene(SCENES / f"{name}.json", [*size, sampler, *overrides])
 
 
 def film_of(r, sample) -> np.ndarray:

@@ -96,7 +96,7 @@ def make_reference(
     if renderer not in MAKERS:
         raise WavefrontError(f"unknown renderer {renderer!r} of references; allowed: {', '.join(MAKERS)}")
     RENDERERS[renderer].check(job)
-    if getattr(job.scene.integrator, "sampler", "independent") != "independent":
+    if job.scene.integrator.sampler != "independent":
         sampler = job.scene.integrator.sampler
         raise WavefrontError(
             f"integrator.sampler is {sampler!r}; a reference takes independent ones: their variance is known"

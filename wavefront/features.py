@@ -35,6 +35,7 @@ class Features:
     # Integrator, camera and film
     nee: bool
     roulette: bool
+    sampler: str
     camera: str
     filter: str
     aovs: tuple[str, ...]  # arrays of the film that the first hit adds to, sorted

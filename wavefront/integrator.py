@@ -62,6 +62,7 @@ def make_features(scene: description.Scene, device_scene: DeviceScene) -> Featur
         light_textures=device_scene.light_texture_kinds,
         nee=integrator.nee,
         roulette=integrator.rr_depth is not None and integrator.rr_depth < integrator.max_depth,
+        sampler=integrator.sampler,
         camera=camera_kind(scene.camera),
         filter=filter_kind(scene.film),
         aovs=tuple(name for name in film_arrays(tuple(scene.film.aovs)) if name in FIRST_HIT),
@@ -94,7 +95,7 @@ class Kernels:
 def make_kernels(f: Features) -> Kernels:
     """Kernels for a set of features; scenes that agree in what a stage reads share its kernel."""
     return Kernels(
-        generate=make_generate(f.camera, f.filter, f.transmission),
+        generate=make_generate(f.camera, f.filter, f.transmission, f.sampler),
         intersect=make_intersect(
             f.triangles,
             f.spheres,
@@ -112,13 +113,15 @@ def make_kernels(f: Features) -> Kernels:
         escaped=make_escaped(f.escape_lights, f.light_sampling) if f.escape_lights else None,
         emission=make_emission(f.lights, f.light_textures, f.light_sampling) if f.area_lights else None,
         aov=make_aov(f.aovs, f.bsdfs, f.mask, f.textures, f.uvs) if f.aovs else None,
-        direct=make_direct(f.bsdfs, f.mask, f.textures, f.lights, f.light_textures, f.uvs, f.tangents, f.maps, f.media)
+        direct=make_direct(
+            f.bsdfs, f.mask, f.textures, f.lights, f.light_textures, f.uvs, f.tangents, f.maps, f.media, f.sampler
+        )
         if f.light_sampling
         else None,
         shadow=make_shadow(f.triangles, f.spheres, f.instances) if f.light_sampling else None,
         drain=drain_rays,
         scatter=make_scatter(
-            f.bsdfs, f.mask, f.textures, f.uvs, f.tangents, f.maps, f.transmission, f.roulette, f.media
+            f.bsdfs, f.mask, f.textures, f.uvs, f.tangents, f.maps, f.transmission, f.roulette, f.media, f.sampler
         ),
         advance=advance_bounce,
         accumulate=make_accumulate(f.variance),

@@ -31,6 +31,7 @@ from wavefront.output import (
     write_outputs,
 )
 from wavefront.renderer import Renderer
+from wavefront.sampler import SAMPLERS
 from wavefront.scene import Scene, json_format, load_scene
 from wavefront.scene.images import HalfOverflowError
 from wavefront.strict import NonFiniteError
@@ -121,6 +122,7 @@ def build_parser() -> argparse.ArgumentParser:
     sampling.add_argument("--max-depth", type=int, metavar="N", help="longest path in segments; 2 is direct light")
     sampling.add_argument("--no-nee", action="store_true", help="no next-event estimation: BSDF sampling alone")
     sampling.add_argument("--no-rr", action="store_true", help="no Russian roulette")
+    sampling.add_argument("--sampler", choices=SAMPLERS, help="of the random numbers; default: the scene's")
     sampling.add_argument("--seed", type=int, default=0, metavar="N", help="of the random numbers; default 0")
     sampling.add_argument(
         "--set", action="append", default=[], metavar="PATH=VALUE", help="change any key, as in integrator.max_depth=6"
@@ -188,6 +190,8 @@ def overrides_from(arguments: argparse.Namespace) -> list[str]:
         overrides.append("integrator.nee=false")
     if arguments.no_rr:
         overrides.append("integrator.rr_depth=null")
+    if arguments.sampler is not None:
+        overrides.append(f"integrator.sampler={arguments.sampler}")
     if arguments.spp is not None:
         overrides.append(f"integrator.spp={arguments.spp}")
     return overrides + arguments.set

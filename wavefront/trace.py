@@ -152,7 +152,7 @@ class TraceWorker(Worker):
         if f.light_sampling:
             arguments = [*tables, self.paths, self.surfaces, wp.uint64(renderer.seed), self.queues.counters]
             arguments += [self.light_index, self.light_sample]
-            self.inspectors["direct"] = (make_inspect_light(f.lights, f.light_textures), arguments)
+            self.inspectors["direct"] = (make_inspect_light(f.lights, f.light_textures, f.sampler), arguments)
         wp.force_load(device, modules=[kernel.module for kernel, _ in self.inspectors.values()])
 
     def trace(self, x: int, y: int, sample: int) -> PathTrace:

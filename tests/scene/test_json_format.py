@@ -151,6 +151,10 @@ def test_text_that_is_not_json_is_refused_with_its_place(error, raw, message):
         ({"film": {"pixel_aspect": 0}}, "film.pixel_aspect: expected a number >= 0.01 and <= 100; found 0"),
         ({"integrator": {"nee": 1}}, "integrator.nee: expected true or false; found 1"),
         (
+            {"integrator": {"sampler": "halton"}},
+            "integrator.sampler: expected 'independent' or 'sobol'; found the string 'halton'",
+        ),
+        (
             {"film": {"aovs": ["albdo"]}},
             "film.aovs[0]: expected 'albedo', 'bsdf_index', 'depth', 'geometric_normal', 'normal', 'position', "
             "'sample_count', 'shape_index', 'uv' or 'variance'; found the string 'albdo'",
@@ -224,7 +228,7 @@ def test_overrides_change_what_is_there_and_add_what_is_not(write):
         (
             "integrator.max_dept=6",
             "integrator: unknown key 'max_dept'; did you mean 'max_depth' or 'rr_depth'? "
-            "valid keys: type, max_depth, rr_depth, nee, spp (set by 'integrator.max_dept=6')",
+            "valid keys: type, max_depth, rr_depth, nee, sampler, spp (set by 'integrator.max_dept=6')",
         ),
         (
             "film.width=big",
@@ -328,7 +332,7 @@ def full_scene(folder):
         description='"quoted" \u00e9\u2028',
         camera=d.Perspective(fov=30.5, fov_axis="y", to_world=list(rows)),
         film=d.Film(width=3, filter=d.GaussianFilter(stddev=0.4), aovs=["normal"], precision="half"),
-        integrator=d.PathIntegrator(max_depth=3, rr_depth=None, nee=False, spp=1),
+        integrator=d.PathIntegrator(max_depth=3, rr_depth=None, nee=False, sampler="sobol", spp=1),
         textures=[bitmap, checks],
         bsdfs=[
             d.Diffuse(name="a", reflectance="image"),

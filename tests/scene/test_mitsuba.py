@@ -400,6 +400,28 @@ def test_integrators(load_xml, body, expected, warning):
 
 
 @pytest.mark.parametrize(
+    ("kind", "sampler", "warns"),
+    [
+        ("independent", "independent", False),
+        ("ldsampler", "sobol", False),
+        ("sobol", "sobol", False),
+        ("multijitter", "sobol", True),
+        ("halton", "sobol", True),
+        ("other", "independent", True),
+    ],
+)
+def test_samplers(load_xml, kind, sampler, warns):
+    numbers = '<integer name="sample_count" value="9"/><integer name="seed" value="1"/>'
+    plugin = f'<sampler type="{kind}">{numbers}</sampler>'
+    path = '<integrator type="path"><integer name="max_depth" value="7"/></integrator>'
+    integrator = load_xml(f'{path}<sensor type="perspective">{plugin}</sensor>', sensor=False).integrator
+    assert integrator == d.PathIntegrator(max_depth=7, sampler=sampler, spp=9)
+    told = [warning for warning in load_xml.warnings if "sampler" in warning]
+    assert len(told) == warns
+    assert not warns or f"is taken as '{sampler}'" in told[0]
+
+
+@pytest.mark.parametrize(
     ("body", "expected", "warns"),
     [
         ('type="box"/>', d.BoxFilter(), False),

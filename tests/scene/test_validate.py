@@ -368,6 +368,15 @@ def test_legal_scenes_pass(scene):
     validate(scene)
 
 
+@pytest.mark.parametrize("sampler", ["independent", "sobol"])
+@pytest.mark.parametrize("aov", ["depth", "variance"])
+def test_a_variance_of_samples_that_are_not_independent_is_a_warning(sampler, aov):
+    film, integrator = d.Film(aovs=[aov]), d.PathIntegrator(sampler=sampler)
+    warnings = validate(d.Scene(shapes=[d.Cube()], emitters=[d.Constant()], film=film, integrator=integrator))
+    assert len(warnings) == (sampler == "sobol" and aov == "variance")
+    assert all("film.aovs: variance is that of independent samples" in warning for warning in warnings)
+
+
 def test_warnings_are_returned_and_passed_on():
     told = []
     assert (

@@ -24,7 +24,8 @@ def rounding_of(name: str) -> float:
 
 
 def like_the_peer(scene: description.Scene, width: int, height: int, max_depth: int, nee: bool = True):
-    """The scene with a film and an integrator as the peer has them: box filter, no Russian roulette."""
+    """The scene with a film and an integrator as the peer has them: box filter, no Russian roulette,
+    independent samples."""
     scene.film = description.Film(width=width, height=height)
     scene.integrator = description.PathIntegrator(max_depth=max_depth, rr_depth=None, nee=nee)
     return scene

@@ -690,6 +690,13 @@ class PathIntegrator(Record, tag_field="type", tag="path"):
     nee: Annotated[
         bool, Meta(description="Next-event estimation; false: emitters are found by BSDF sampling only.")
     ] = True
+    sampler: Annotated[
+        Literal["independent", "sobol"],
+        Meta(
+            description="Random numbers: independent, or Owen-scrambled Sobol points, with less noise for the same "
+            "number of samples; powers of two are best."
+        ),
+    ] = "independent"
     spp: Annotated[int, Meta(ge=1, le=2**31 - 1, description="Samples per pixel.")] = 64
 
 

@@ -5,7 +5,7 @@ or is left out. Where the dialects differ in meaning, Mitsuba 3.9 decides: it is
 
 Choices: unlimited `max_depth` (-1) becomes 1000. Integrators that compute the same image another way (bdpt, sppm, ...)
 become `path` with a warning, and `direct` becomes `path` of depth 2. Filters that the records lack become a Gaussian.
-Media absorb whatever the integrator.
+Media absorb whatever the integrator. Samplers of low discrepancy and stratified ones become `sobol`.
 """
 
 from __future__ import annotations
@@ -34,6 +34,8 @@ _DIAGONAL_35MM = 43.266615300557  # millimetres: the film that a focal length re
 
 _INTEGRATORS_OF_ANOTHER_IMAGE = ("ao", "aov", "depth", "field", "irrcache", "moment", "multichannel", "stokes", "vaov")
 _NESTED = ("bsdf", "emitter")
+_SOBOL = ("ldsampler", "sobol")  # samplers of scrambled Sobol points
+_STRATIFIED = ("halton", "hammersley", "multijitter", "orthogonal", "stratified")
 
 
 def load(
@@ -88,8 +90,8 @@ class _Importer:
         root.finish(*groups)
         if len(groups.get("integrator", [])) > 1:
             raise groups["integrator"][1].error("a scene has one integrator")
-        camera, film, spp = self._sensor(groups.get("sensor", []))
-        integrator = self._integrator(groups.get("integrator", [None])[0], spp)
+        camera, film, sampling = self._sensor(groups.get("sensor", []))
+        integrator = self._integrator(groups.get("integrator", [None])[0], sampling)
         shapes, instances = [], []
         for plugin in groups.get("shape", []):
             if plugin.type == "instance":
@@ -132,10 +134,10 @@ class _Importer:
             if plugin.get(name) is not None:
                 self.warn(f"{plugin.get(name).where()}: {name} is left out; nothing is clipped")
         plugin.ignore("focus_distance", "shutter_open", "shutter_close", "near_clip", "far_clip")
-        spp = self._sampler(plugin)
+        sampling = self._sampler(plugin)
         film = self._film(plugin)
         plugin.finish("film", "sampler", "medium")
-        return camera, film, spp
+        return camera, film, sampling
 
     def _perspective(self, plugin):
         offset = tuple(plugin.number(f"principal_point_offset_{axis}", 0.0) for axis in "xy")
@@ -177,19 +179,22 @@ class _Importer:
         return math.degrees(2.0 * math.atan(_DIAGONAL_35MM / (2.0 * focal)))
 
     def _sampler(self, sensor):
+        """The fields of the integrator that a sampler has."""
         samplers = sensor.objects("sampler")
         if not samplers:
-            return 4
+            return {"spp": 4}
         sampler = samplers[0]
         spp = sampler.integer("sample_count", 4)
         if not 1 <= spp < 2**31:
             raise sampler.error(f"sample_count must be at least 1; found {spp}")
+        ours = "sobol" if sampler.type in (*_SOBOL, *_STRATIFIED) else "independent"
+        if sampler.type not in ("independent", *_SOBOL):
+            self.warn(f"{sampler.where()}: {sampler.label()} is taken as {ours!r}")
         if sampler.type != "independent":
-            self.warn(f"{sampler.where()}: {sampler.label()} is taken as 'independent'")
             sampler.ignore(*sampler.properties)
         sampler.ignore("seed", "jitter")
         sampler.finish()
-        return spp
+        return {"spp": spp, "sampler": ours}
 
     def _film(self, sensor):
         films = sensor.objects("film")
@@ -245,10 +250,10 @@ class _Importer:
             raise plugin.get(name).error(f"{name} must be greater than 0; found {value:g}")
         return value
 
-    def _integrator(self, plugin, spp):
+    def _integrator(self, plugin, sampling):
         if plugin is None:
             self.warn(f"{self.document.path}: the scene has no integrator; 'path' of depth {UNLIMITED_DEPTH} is used")
-            return description.PathIntegrator(max_depth=UNLIMITED_DEPTH, spp=spp)
+            return description.PathIntegrator(max_depth=UNLIMITED_DEPTH, **sampling)
         if plugin.type in _INTEGRATORS_OF_ANOTHER_IMAGE:
             raise plugin.error(f"{plugin.label()} is not supported; supported: path, direct")
         if plugin.type == "direct":
@@ -272,7 +277,7 @@ class _Importer:
             raise plugin.get("max_depth").error(f"max_depth must be -1 or from 1 to 1000000; found {max_depth}")
         if rr_depth is not None and rr_depth < 1:
             raise plugin.get("rr_depth").error(f"rr_depth must be at least 1; found {rr_depth}")
-        return description.PathIntegrator(max_depth=max_depth, rr_depth=rr_depth, spp=spp)
+        return description.PathIntegrator(max_depth=max_depth, rr_depth=rr_depth, **sampling)
 
     # --- shapes -------------------------------------------------------------------------------------------------
 

@@ -98,6 +98,11 @@ def _find_warnings(scene):
             warnings.append(
                 f"emitters[{i}]: a {kind} light adds nothing where integrator.nee is false: no ray meets it"
             )
+    if "variance" in scene.film.aovs and scene.integrator.sampler != "independent":
+        warnings.append(
+            "film.aovs: variance is that of independent samples; those of integrator.sampler "
+            f"{shown(scene.integrator.sampler)} are not, and have less as a rule"
+        )
     for kind in ("textures", "bsdfs", "media"):
         for i, record in enumerate(getattr(scene, kind)):
             if not record.name:

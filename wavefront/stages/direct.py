@@ -24,7 +24,8 @@ from wavefront.queues import (
     push,
     queue_size,
 )
-from wavefront.rng import PURPOSE_LIGHT, uniform4
+from wavefront.rng import PURPOSE_LIGHT
+from wavefront.sampler import SAMPLERS
 from wavefront.surface import spawn_origin
 from wavefront.texture import TextureTables
 
@@ -40,11 +41,13 @@ def make_direct(
     tangents: bool,
     maps: tuple[str, ...],
     media: bool = False,
+    sampler: str = "independent",
 ):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
     eval_bsdf, _, _ = make_bsdf(bsdfs, mask, textures, tangents, bool(maps))
     frame_at, _ = make_frame(tangents, bool(maps))
     sample_light, _ = make_light_sampler(lights, light_textures)
+    draw = SAMPLERS[sampler]
     extended = any(kind not in DELTA for kind in lights)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -73,7 +76,7 @@ def make_direct(
             return
 
         # propose
-        u = uniform4(seed, paths.pixel[slot], paths.sample[slot], counters[DEPTH], PURPOSE_LIGHT)
+        u = draw(seed, paths.pixel[slot], paths.sample[slot], counters[DEPTH], PURPOSE_LIGHT)
         position = surfaces.position[slot]
         light = sample_light(lights, geometry, textures, position, u)
         if light.L[0] + light.L[1] + light.L[2] == 0.0:

@@ -26,12 +26,13 @@ from wavefront.queues import (
     Paths,
     Queue,
 )
-from wavefront.rng import PURPOSE_CAMERA, uniform4
+from wavefront.rng import PURPOSE_CAMERA
+from wavefront.sampler import SAMPLERS
 from wavefront.warp_samples import square_to_gaussian, square_to_tent
 
 
 @functools.cache
-def make_generate(camera_kind: str, filter_kind: str, transmission: bool):
+def make_generate(camera_kind: str, filter_kind: str, transmission: bool, sampler: str = "independent"):
     """Kernel of the stage.
 
     Args:
@@ -39,8 +40,10 @@ def make_generate(camera_kind: str, filter_kind: str, transmission: bool):
         filter_kind: Reconstruction filter, ``box``, ``tent`` or ``gaussian``, sampled so that each sample counts for
             its own pixel alone (Ernst, Stamminger and Greiner 2006, "Filter Importance Sampling").
         transmission: Whether paths track the index of refraction.
+        sampler: A key of `wavefront.sampler.SAMPLERS`.
     """
     camera_ray = make_camera_ray(camera_kind)
+    draw = SAMPLERS[sampler]
 
     @wp.kernel(enable_backward=False, module="unique")
     def generate_rays(
@@ -75,7 +78,7 @@ def make_generate(camera_kind: str, filter_kind: str, transmission: bool):
         y = window.y + tile[TILE_Y] + local // tile[TILE_WIDTH]
         pixel = wp.uint32(y) * wp.uint32(window.film_width) + wp.uint32(x)
         sample = wp.uint32(tile[FIRST_SAMPLE] + slot % samples)
-        u = uniform4(seed, pixel, sample, 0, PURPOSE_CAMERA)
+        u = draw(seed, pixel, sample, 0, PURPOSE_CAMERA)
         square = wp.vec2(u[0], u[1])
         offset = wp.vec2(u[0] - 0.5, u[1] - 0.5)
         if wp.static(filter_kind == "tent"):

@@ -10,7 +10,8 @@ from wavefront.bsdf.tables import MaterialTables
 from wavefront.light.sampling import LightSample, make_light_sampler, select_light
 from wavefront.light.tables import LightTables
 from wavefront.queues import DEPTH, Paths, Surfaces
-from wavefront.rng import PURPOSE_LIGHT, uniform4
+from wavefront.rng import PURPOSE_LIGHT
+from wavefront.sampler import SAMPLERS
 from wavefront.texture import TextureTables
 
 
@@ -33,13 +34,14 @@ def make_inspect_hit(triangles: bool, spheres: bool, instances: tuple[str, ...])
 
 
 @functools.cache
-def make_inspect_light(lights: tuple[str, ...], light_textures: tuple[str, ...]):
+def make_inspect_light(lights: tuple[str, ...], light_textures: tuple[str, ...], sampler: str = "independent"):
     """Kernel that draws the light sample of slot 0 as the direct-light stage does, with the same random numbers.
 
     The arguments are fields of `Features`. The index of the light is -1 where that stage draws none, on a surface that
     only reflects or refracts like a mirror.
     """
     sample_light, _ = make_light_sampler(lights, light_textures)
+    draw = SAMPLERS[sampler]
 
     @wp.kernel(enable_backward=False, module="unique")
     def inspect_light(
@@ -58,7 +60,7 @@ def make_inspect_light(lights: tuple[str, ...], light_textures: tuple[str, ...])
         index[0] = -1
         cos_o = -wp.dot(surfaces.shading_normal[0], paths.direction[0])
         if is_smooth(materials.materials[surfaces.material[0]], cos_o):
-            u = uniform4(seed, paths.pixel[0], paths.sample[0], counters[DEPTH], PURPOSE_LIGHT)
+            u = draw(seed, paths.pixel[0], paths.sample[0], counters[DEPTH], PURPOSE_LIGHT)
             index[0] = select_light(lights, u[0])
             sample[0] = sample_light(lights, geometry, textures, surfaces.position[0], u)
 

@@ -11,7 +11,8 @@ from wavefront.bsdf.frame import make_frame
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.medium import medium_towards
 from wavefront.queues import DEPTH, NONFINITE_SCATTER, Paths, Queue, Surfaces, push, queue_size
-from wavefront.rng import PURPOSE_BSDF, uniform4
+from wavefront.rng import PURPOSE_BSDF
+from wavefront.sampler import SAMPLERS
 from wavefront.surface import spawn_origin
 from wavefront.texture import TextureTables
 
@@ -34,10 +35,12 @@ def make_scatter(
     transmission: bool,
     roulette: bool,
     media: bool = False,
+    sampler: str = "independent",
 ):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
     _, sample_bsdf, _ = make_bsdf(bsdfs, mask, textures, tangents, bool(maps))
     frame_at, _ = make_frame(tangents, bool(maps))
+    draw = SAMPLERS[sampler]
 
     @wp.kernel(enable_backward=False, module="unique")
     def scatter_paths(
@@ -60,7 +63,7 @@ def make_scatter(
         depth = counters[DEPTH]
 
         # propose
-        u = uniform4(seed, paths.pixel[slot], paths.sample[slot], depth, PURPOSE_BSDF)
+        u = draw(seed, paths.pixel[slot], paths.sample[slot], depth, PURPOSE_BSDF)
         uv = wp.vec2(0.0)
         if wp.static(uvs):
             uv = surfaces.uv[slot]
