@@ -309,6 +309,18 @@ def test_false_colours(viewer):
     assert_shown(viewer, tone_map(stored("slow 16")))
 
 
+def test_false_colours_of_flip(browser, tmp_path):
+    pytest.importorskip("flip_evaluator", reason="the FLIP metric needs the package flip-evaluator")
+    made = write_results(tmp_path / "flip", {"room": SCENES["room"]}, metrics=("flip", "mse"))
+    assert report.main([str(made)]) == 0
+    with opened(browser, made / "report.html") as page:
+        page.locator("#stage").focus()
+        viewer = Viewer(page).press("2", "f")
+        assert page.locator("#error-metric").input_value() == "flip"
+        errors = error_map("flip", radiance("room fast 16", *SCENES["room"]), stored("reference"))
+        assert_shown(viewer, colours_of(errors, float(viewer.text("#white-value"))), tolerance=STEP)
+
+
 def test_crops(viewer):
     """That of the command line, one chosen by the mouse, and their errors; all follow exposure and budget."""
     assert viewer.page.locator(".crop canvas").count() == 3
