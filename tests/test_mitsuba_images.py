@@ -13,6 +13,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -228,6 +230,27 @@ def test_reference(name):
     tiles = (9, 16) if width * 9 == height * 16 else (8, 8)
     theirs = Estimate.from_variance(image, error**2, tiles)
     check(f"{name}, reference", compare(ours, theirs, tiles, most=1024))
+
+
+# --- the peer itself ---------------------------------------------------------------------------------------------
+
+READ_AFTER_RENDER = """
+import sys
+import mitsuba as mi, numpy as np
+from tools.peers import mitsuba as peer
+peer.use_variant("scalar_rgb", threads=1)
+mi.Bitmap(np.ones((64, 64, 3), np.float32)).write(sys.argv[1])
+scene = mi.load_dict({**mi.cornell_box(), "sensor": {**mi.cornell_box()["sensor"], "film": {"type": "hdrfilm",
+    "width": 8, "height": 8}}})
+assert peer.render(scene, 1).shape == (8, 8, 3)
+mi.load_dict({"type": "bitmap", "filename": sys.argv[1]})
+"""
+
+
+def test_one_thread_reads_openexr(tmp_path):
+    """With one thread Mitsuba 3.9 waits forever for an OpenEXR file: only while it renders there is but one."""
+    command = [sys.executable, "-c", READ_AFTER_RENDER, str(tmp_path / "a.exr")]
+    subprocess.run(command, check=True, timeout=120, cwd=Path(__file__).parent.parent)
 
 
 # --- the test itself ---------------------------------------------------------------------------------------------

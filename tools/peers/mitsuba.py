@@ -6,6 +6,7 @@ with `use_variant` before anything is loaded, and load scenes again after changi
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,6 +20,7 @@ from wavefront.scene import description
 __all__ = ["from_records", "load_records", "load_xml", "missing", "render", "require", "use_variant"]
 
 PATHS_PER_PASS = 1 << 24  # the arrays of a wavefront stay within some GB
+_chosen: dict[str, int | None] = {"threads": None}  # by `use_variant`
 
 
 def require():
@@ -57,7 +59,7 @@ def use_variant(name: str, threads: int | None = None):
 
     Args:
         name: Such as ``scalar_rgb``.
-        threads: How many threads render, the calling one among them; None: as many as cores.
+        threads: How many threads render from now on, the calling one among them; None: as many as cores.
 
     Returns:
         The module `mitsuba`.
@@ -71,16 +73,27 @@ def use_variant(name: str, threads: int | None = None):
     mi = require()
     mi.set_variant(name)
     mi.set_log_level(mi.LogLevel.Error)
-    if threads is not None:
-        set_threads(threads)
+    import drjit
+
+    _chosen["threads"] = drjit.thread_count() if threads is None else threads
+    drjit.set_thread_count(max(drjit.thread_count(), 2))  # see `_rendering_threads`
     return mi
 
 
-def set_threads(threads: int) -> None:
-    """How many threads render from now on, the calling one among them."""
+@contextlib.contextmanager
+def _rendering_threads(threads: int | None):
+    """Limits the threads of Mitsuba to these, and to those of `use_variant` for None, for as long as it renders.
+
+    Never for longer: with one thread, Mitsuba 3.9 waits forever when it reads an OpenEXR file.
+    """
     import drjit
 
-    drjit.set_thread_count(threads)
+    before = drjit.thread_count()
+    drjit.set_thread_count(threads or _chosen["threads"] or before)
+    try:
+        yield
+    finally:
+        drjit.set_thread_count(max(before, 2))
 
 
 # --- scenes ------------------------------------------------------------------------------------------------------
@@ -216,8 +229,6 @@ def render(
         raise WavefrontError(f"spp {spp}, seed {seed}; allowed: spp of 1 or more, seeds from 0 to {(1 << 20) - 1}")
     if max_depth < 1 or (rr_depth is not None and rr_depth < 1):
         raise WavefrontError(f"max_depth {max_depth}, rr_depth {rr_depth}; allowed: 1 or more")
-    if threads is not None:
-        set_threads(threads)
     rr_depth = NEVER if rr_depth is None else rr_depth
     plugin = mi.load_dict({"type": integrator, "max_depth": max_depth, "rr_depth": rr_depth})
     camera = scene.sensors()[sensor]
@@ -227,11 +238,12 @@ def render(
     if passes > 1 << 12:
         raise WavefrontError(f"{spp} samples of {pixels} pixels are more than this peer renders")
     total, done = 0.0, 0
-    for i in range(passes):
-        samples = (spp * (i + 1)) // passes - done
-        image = mi.render(scene, sensor=camera, integrator=plugin, spp=samples, seed=(seed << 12) + i)
-        total = total + samples * np.array(image, np.float64)[..., :3]
-        done += samples
+    with _rendering_threads(threads):
+        for i in range(passes):
+            samples = (spp * (i + 1)) // passes - done
+            image = mi.render(scene, sensor=camera, integrator=plugin, spp=samples, seed=(seed << 12) + i)
+            total = total + samples * np.array(image, np.float64)[..., :3]
+            done += samples
     return total / spp
 
 
