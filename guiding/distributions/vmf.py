@@ -83,9 +83,12 @@ def sample_one_minus_cosine(kappa: float, u: float) -> float:
     if kappa < _UNIFORM:
         return 2.0 * u
     e = u * expm1(-2.0 * kappa)
+    exponent = 0.0
     if e > -0.5:
-        return -log1p(e) / kappa
-    return wp.min(-wp.log((1.0 - u) + u * wp.exp(-2.0 * kappa)) / kappa, 2.0)
+        exponent = -log1p(e)
+    else:
+        exponent = -wp.log((1.0 - u) + u * wp.exp(-2.0 * kappa))
+    return wp.min(exponent / kappa, 2.0)
 
 
 @wp.func

@@ -158,10 +158,7 @@ _FROM_RAW = {
 # --- mixtures --------------------------------------------------------------------------------------------------------
 
 
-@functools.cache
-def make_vmf_mixture(
-    n_lobes: int, direction: str = "angles", log_kappa_limit: float = LOG_KAPPA_LIMIT
-) -> VmfMixture:
+def make_vmf_mixture(n_lobes: int, direction: str = "angles", log_kappa_limit: float = LOG_KAPPA_LIMIT) -> VmfMixture:
     """The functions of mixtures of `n_lobes` lobes.
 
     Args:
@@ -179,9 +176,12 @@ def make_vmf_mixture(
         raise ValueError(f"direction: found {direction!r}; allowed: {', '.join(DIRECTIONS)}")
     if not 0.0 < log_kappa_limit <= LOG_KAPPA_LIMIT:
         raise ValueError(f"log_kappa_limit: found {log_kappa_limit}; allowed: above 0, at most {LOG_KAPPA_LIMIT}")
-    K = n_lobes
+    return _make(int(n_lobes), direction, float(log_kappa_limit))
+
+
+@functools.cache
+def _make(K: int, direction: str, limit: float) -> VmfMixture:
     stride = 2 + DIRECTIONS[direction]
-    limit = float(log_kappa_limit)
     to_direction, direction_gradient = _FROM_RAW[direction]
     lobes = wp.types.vector(K, wp.float32)
 
@@ -399,7 +399,7 @@ def make_vmf_mixture(
         return -weight * log_pdf_gradient(y, y_offset, w, -weight * factor, dL_dy, dL_dy_offset)
 
     return VmfMixture(
-        n_lobes,
+        K,
         direction,
         K * stride,
         Mixture,

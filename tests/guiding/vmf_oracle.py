@@ -8,22 +8,33 @@ from __future__ import annotations
 
 import mpmath
 import numpy as np
-from scipy.special import logsumexp
 
 LOG_KAPPA_LIMIT = 20.0
 
 
+def log_sum(x) -> np.ndarray:
+    """log of the sum of exponentials along the last axis."""
+    highest = np.max(np.real(x), axis=-1, keepdims=True)
+    return np.log(np.sum(np.exp(x - highest), axis=-1)) + highest[..., 0]
+
+
+def length(v) -> np.ndarray:
+    return np.sqrt(np.sum(v * v, axis=-1))
+
+
 def unit(v) -> np.ndarray:
-    v = np.asarray(v, np.float64)
-    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+    v = np.asarray(v)
+    v = v.astype(np.result_type(v, np.float64))
+    return v / length(v)[..., None]
 
 
 def log_sinhc(x) -> np.ndarray:
     """log(sinh(x) / x), 0 at 0."""
-    x = np.asarray(x, np.float64)
-    tiny = x < 1e-4
+    x = np.asarray(x)
+    tiny = np.real(x) < 1e-3
     safe = np.where(tiny, 1.0, x)
-    return np.where(tiny, x * x / 6.0, safe + np.log(-np.expm1(-2.0 * safe) / (2.0 * safe)))
+    small = x * x / 6.0 - x**4 / 180.0
+    return np.where(tiny, small, safe + np.log(-np.expm1(-2.0 * safe) / (2.0 * safe)))
 
 
 def vmf_log_pdf(mu, kappa, w) -> np.ndarray:
@@ -53,10 +64,13 @@ def per_lobe(direction: str) -> int:
 
 def decode(raw, direction: str):
     """log weights [n, K], kappa [n, K] and mu [n, K, 3] of raw outputs [n, K · 4 or 5]."""
-    raw = np.asarray(raw, np.float64)
+    raw = np.asarray(raw)
+    raw = raw.astype(np.result_type(raw, np.float64))
     lobes = raw.reshape(len(raw), -1, per_lobe(direction))
-    log_weight = lobes[..., 0] - logsumexp(lobes[..., 0], axis=1, keepdims=True)
-    kappa = np.exp(np.clip(lobes[..., 1], -LOG_KAPPA_LIMIT, LOG_KAPPA_LIMIT))
+    log_weight = lobes[..., 0] - log_sum(lobes[..., 0])[:, None]
+    log_kappa = lobes[..., 1]
+    outside = np.abs(np.real(log_kappa)) > LOG_KAPPA_LIMIT
+    kappa = np.exp(np.where(outside, np.copysign(LOG_KAPPA_LIMIT, np.real(log_kappa)), log_kappa))
     if direction == "vector":
         return log_weight, kappa, unit(lobes[..., 2:])
     theta = np.pi * 0.5 * (1.0 + np.tanh(lobes[..., 2] / 2.0))
@@ -77,38 +91,55 @@ def encode(weight, kappa, mu, direction: str) -> np.ndarray:
     return np.stack(columns, axis=-1).reshape(-1)
 
 
-def log_terms(raw, w, direction: str) -> np.ndarray:
+# Of decoded mixtures, (log weights [n, K], kappa [n, K], mu [n, K, 3]), and directions w [n, 3]:
+
+
+def log_terms(mixture, w) -> np.ndarray:
     """Logarithms of the weighted densities of lobes [n, K]."""
-    log_weight, kappa, mu = decode(raw, direction)
+    log_weight, kappa, mu = mixture
     return log_weight + vmf_log_pdf(mu, kappa, np.asarray(w)[:, None, :])
 
 
-def log_pdf(raw, w, direction: str) -> np.ndarray:
-    return logsumexp(log_terms(raw, w, direction), axis=1)
+def log_pdf(mixture, w) -> np.ndarray:
+    return log_sum(log_terms(mixture, w))
 
 
-def product_log_pdf(raw, w, other_mu, other_kappa, direction: str) -> np.ndarray:
-    """Of the normalised product with the lobe (other_mu [n, 3], other_kappa [n])."""
-    log_weight, kappa, mu = decode(raw, direction)
-    other_kappa = np.asarray(other_kappa, np.float64)
-    joint = kappa[..., None] * mu + (other_kappa[:, None] * unit(other_mu))[:, None, :]
-    mass = log_weight - log_sinhc(kappa) + log_sinhc(np.linalg.norm(joint, axis=-1))
-    # without the integral of the other lobe, above and below
-    value = log_pdf(raw, w, direction) + other_kappa * np.sum(unit(other_mu) * unit(w), axis=-1)
-    return value - logsumexp(mass, axis=1)
+def product_log_masses(mixture, other_mu, other_kappa) -> np.ndarray:
+    """Logarithms [n, K] of the masses of the lobes times the lobe (other_mu [n, 3], other_kappa [n]).
+
+    All but for the integral of exp(s · w) of that lobe, which all share.
+    """
+    log_weight, kappa, mu = mixture
+    joint = kappa[..., None] * unit(mu) + (np.asarray(other_kappa)[:, None] * unit(other_mu))[:, None, :]
+    return log_weight - log_sinhc(kappa) + log_sinhc(length(joint))
 
 
-def gradient(function, raw, step) -> np.ndarray:
-    """Central differences of `function` of raw rows [n, P] -> [n]; `step` [n] or a number."""
+def product_log_pdf(mixture, w, other_mu, other_kappa) -> np.ndarray:
+    """Of the normalised product with the lobe."""
+    other = np.asarray(other_kappa) * np.sum(unit(other_mu) * unit(w), axis=-1)
+    return log_pdf(mixture, w) + other - log_sum(product_log_masses(mixture, other_mu, other_kappa))
+
+
+def derivatives(raw, direction: str, at=None):
+    """For each raw output i the mixture with its derivatives along i times 1e-30 as imaginary parts.
+
+    So the imaginary part of a function of it, times 1e30, is a difference without cancellation (Squire and Trapp 1998).
+    `at`: (kappa, mu) to differentiate at, as decoded in float32.
+    """
     raw = np.asarray(raw, np.float64)
-    result = np.zeros_like(raw)
-    step = np.broadcast_to(np.asarray(step, np.float64), len(raw))
     for i in range(raw.shape[1]):
-        high, low = raw.copy(), raw.copy()
-        high[:, i] += step
-        low[:, i] -= step
-        result[:, i] = (function(high) - function(low)) / (high[:, i] - low[:, i])
-    return result
+        step = np.zeros(raw.shape[1], complex)
+        step[i] = 1e-30j
+        log_weight, kappa, mu = decode(raw + step, direction)
+        if at is not None:
+            kappa = at[0] + 1j * kappa.imag
+            mu = unit(at[1]) + 1j * mu.imag
+        yield log_weight, kappa, mu
+
+
+def gradient(function, raw, direction: str, at=None) -> np.ndarray:
+    """Of a function of mixtures [n], with respect to raw outputs [n, P]."""
+    return np.stack([function(mixture).imag * 1e30 for mixture in derivatives(raw, direction, at)], axis=1)
 
 
 def frame(mu) -> np.ndarray:
