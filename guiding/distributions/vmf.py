@@ -20,9 +20,9 @@ _INV_TWO_PI = wp.constant(0.15915494309189535)
 _UNIFORM = wp.constant(1.0e-15)  # a kappa below this is zero in float32; its products and squares would leave the range
 
 # The lobe that stands for the clamped cosine, max(cos, 0) / pi, as in the published code of Dong et al. 2023. It is
-# close to the best fit of one lobe in the mean square over the sphere, kappa = 2.2925. Its error, as tested: 0.0247
-# root mean square (19.0 % of the cosine's own), 0.0440 at most (the peak, 1/pi = 0.3183, is 0.3530); total variation
-# 0.132; KL(cosine || lobe) 0.1266, where the best is 0.0919 at kappa = 2.9515; 10.07 % of its mass is below the horizon.
+# close to the best fit of one lobe in the mean square over the sphere, kappa = 2.2925. Its error: 0.0247 root mean
+# square (19.0 % of the cosine's own), 0.0440 at most (the peak, 1/pi = 0.3183, is 0.3530); total variation 0.132;
+# KL(cosine || lobe) 0.1266, where the best is 0.0919 at kappa = 2.9515. 10.07 % of its mass is below the horizon.
 COSINE_KAPPA = wp.constant(2.19)
 
 
@@ -75,7 +75,7 @@ def vmf_moments(kappa: float) -> wp.vec2:
 
 @wp.func
 def sample_one_minus_cosine(kappa: float, u: float) -> float:
-    """h from u in [0, 1), increasing: the inverse of the distribution function (1 - exp(-kappa h)) / (1 - exp(-2 kappa)).
+    """h from u in [0, 1): the inverse of the distribution function u = (1 - exp(-kappa h)) / (1 - exp(-2 kappa)).
 
     Jakob's logarithm is log(1 - u (1 - exp(-2 kappa))). Where it is small it is a `log1p`; where it is large, a sum of
     two numbers that are not negative. So h has all its digits at both ends.
@@ -122,8 +122,8 @@ def multiply_vmf(mu: wp.vec3, kappa: float, other_mu: wp.vec3, other_kappa: floa
 
         exp(-kappa h) exp(-other_kappa other_h) = exp(-loss) exp(-kappa' h'),    loss = kappa + other_kappa - kappa'.
 
-    The loss is a difference of large numbers, and is computed as 2 kappa other_kappa h0 / (kappa + other_kappa + kappa')
-    instead, with h0 that of the angle between the two.
+    The loss is a difference of large numbers; 2 kappa other_kappa h0 / (kappa + other_kappa + kappa'), with h0 of the
+    angle between the two, is equal and loses nothing.
 
     Returns:
         mu', kappa' and loss.

@@ -5,13 +5,16 @@ A lobe takes consecutive outputs, in the order of Dong et al. 2023 ("Neural Para
 - a logit; the weights are the softmax of all logits;
 - log kappa;
 - the mean direction, either as two ``angles`` by the logistic function, theta = pi sigma(a) from +z and phi =
-  2 pi sigma(b) from +x towards +y; or as a ``vector`` of three, which is normalised. Angles are theirs. They have poles,
-  and no value of b reaches phi = 0, across which lobes cannot move; a vector has neither, but no direction at zero.
+  2 pi sigma(b) from +x towards +y; or as a ``vector`` of three, which is normalised. Angles are theirs. They have
+  poles, and a lobe cannot move across phi = 0, which no b reaches; a vector has neither, but no direction at zero.
 
 Every raw output that is finite gives a mixture whose density, samples and gradients are finite. Nothing is done about
 one that is not.
 
-A mixture is decoded once per vertex and then evaluated for several directions. TIMING
+A mixture is decoded once per vertex, into a struct, and evaluated there for every direction. On one core of an AMD EPYC
+and with 8 lobes, decoding takes 500 ns for angles and 240 ns for vectors, and then a density 28, its logarithm 44, a
+sample 55 and the product with a lobe 140 ns; without the struct each of them would decode again. A gradient, which
+decodes, takes 900 and 450 ns. Times are proportional to the number of lobes.
 """
 
 import dataclasses
@@ -38,7 +41,7 @@ _SHORTEST = wp.constant(1.0e-6)  # a raw vector with no component beyond this ha
 class VmfMixture:
     """The functions of a mixture with a fixed number of lobes, for kernels. Directions are unit vectors.
 
-    A kernel uses them through `wp.static`, or by names of its factory.
+    A kernel calls them as ``wp.static(mixture.pdf)``, or by names in the function that makes it.
 
     Attributes:
         n_lobes: K.
@@ -51,13 +54,13 @@ class VmfMixture:
         sample: (mixture, u) -> w, of three numbers in [0, 1): u[0] and u[1] give the direction and u[2] the lobe.
         multiply: (mixture, mu, kappa) -> Mixture; the normalised product with one lobe, again a mixture.
         log_pdf_gradient: (raw, offset, w, factor, gradient, gradient_offset) -> log pdf; writes `factor` times its
-            derivatives with respect to the raw outputs to the flat array `gradient`.
-        product_log_pdf_gradient: (raw, offset, mu, kappa, w, factor, gradient, gradient_offset) -> log pdf; the same for
-            the normalised product with one lobe.
-        kl_loss: A loss for `nn.Model`. A row of its target is w and then the weight f(w) / q(w), where f is the function
-            to learn and q the density that w was drawn with; further columns are not read. Its value, -weight ·
-            log pdf(w), has the mean KL(f || pdf) + constant if f is normalised, and in any case a mean whose
-            gradient is the integral of f times that of the divergence from f normalised.
+            derivatives with respect to the raw outputs to the flat array `gradient`, which must not overlap `raw`.
+        product_log_pdf_gradient: (raw, offset, mu, kappa, w, factor, gradient, gradient_offset) -> log pdf; the same
+            for the normalised product with one lobe.
+        kl_loss: A loss for `nn.Model` (see `nn.losses`). A row of its target is w and then the weight f(w) / q(w), f
+            being the function to learn, not negative, and q the density that w was drawn with; further columns are not
+            read. Its value, -weight · log pdf(w), has the mean F · (KL(f / F || pdf) + entropy of f / F), where F is
+            the integral of f. So its gradient is an estimate, by one sample, of F times that of the divergence.
     """
 
     n_lobes: int
@@ -109,9 +112,7 @@ def _angles_to_direction(raw: wp.array[wp.float32], at: int) -> wp.vec3:
 
 
 @wp.func
-def _angles_gradient(
-    raw: wp.array[wp.float32], at: int, dmu: wp.vec3, gradient: wp.array[wp.float32], to: int
-):
+def _angles_gradient(raw: wp.array[wp.float32], at: int, dmu: wp.vec3, gradient: wp.array[wp.float32], to: int):
     """Writes the derivatives along the raw angles of a function whose gradient with respect to mu is dmu."""
     polar = _polar(raw, at)
     azimuth = _azimuth(raw, at + 1)
@@ -132,14 +133,12 @@ def _scaled_vector(raw: wp.array[wp.float32], at: int):
 
 @wp.func
 def _vector_to_direction(raw: wp.array[wp.float32], at: int) -> wp.vec3:
-    v, size = _scaled_vector(raw, at)
+    v, _size = _scaled_vector(raw, at)
     return v / wp.length(v)
 
 
 @wp.func
-def _vector_gradient(
-    raw: wp.array[wp.float32], at: int, dmu: wp.vec3, gradient: wp.array[wp.float32], to: int
-):
+def _vector_gradient(raw: wp.array[wp.float32], at: int, dmu: wp.vec3, gradient: wp.array[wp.float32], to: int):
     """As `_angles_gradient`, for the raw vector: the part of dmu across it, over its length."""
     v, size = _scaled_vector(raw, at)
     length = wp.length(v)
@@ -194,8 +193,8 @@ def _make(K: int, direction: str, limit: float) -> VmfMixture:
         mu_y: lobes
         mu_z: lobes
 
-    # A field of the struct is read once, into a variable: an entry of a field would copy all of it wherever Warp leaves a
-    # loop as it is, which is beyond 16 lobes.
+    # A field of the struct is read once, into a variable: reading an entry of it copies the whole field wherever Warp
+    # leaves a loop as it is, which is beyond 16 lobes.
 
     @wp.func
     def normalized(logs: lobes, log_peak: lobes, kappa: lobes, x: lobes, y: lobes, z: lobes) -> Mixture:
@@ -340,7 +339,7 @@ def _make(K: int, direction: str, limit: float) -> VmfMixture:
             if other_kappa > 0.0:
                 # d z / d kappa = A' mu · mu' - A and d z / d mu = A' kappa mu', A and A' the mean cosines of the lobe
                 # and of its product; 1 - mu · mu' and the part of mu' across mu follow from other_mu
-                product_mu, product_kappa, loss = multiply_vmf(mu, kappa, other_mu, other_kappa)
+                _mu, product_kappa, loss = multiply_vmf(mu, kappa, other_mu, other_kappa)
                 product = vmf_moments(product_kappa)
                 pull = share[k] * product[1] * other_kappa
                 turn = one_minus_cosine(mu, other_mu) * (2.0 * other_kappa - loss)

@@ -93,7 +93,9 @@ def test_density_against_60_digits(kappa):
     rng = np.random.default_rng(5)
     for mu in MUS.values():
         mu = np.asarray(mu, np.float32)
-        h = np.concatenate([[0.0, 2.0, 1.0], rng.uniform(0.0, 2.0, 10), np.minimum(2.0, rng.exponential(size=20) / max(kappa, 1e-3))])
+        h = np.concatenate(
+            [[0.0, 2.0, 1.0], rng.uniform(0.0, 2.0, 10), np.minimum(2.0, rng.exponential(size=20) / max(kappa, 1e-3))]
+        )
         w = around(mu, h, rng.uniform(0.0, 6.28, len(h)))
         pdf, log_pdf, *_ = lobe(mu, kappa, w)
         exact = np.array([float(oracle.precise_vmf_log_pdf(mu, np.float32(kappa), one)) for one in w])
@@ -131,7 +133,8 @@ def test_angle_of_a_sample_against_60_digits(kappa):
     with mpmath.workdps(60):
         k = mpmath.mpf(float(np.float32(kappa)))
         exact = [
-            float(-mpmath.log(1 + mpmath.mpf(float(x)) * mpmath.expm1(-2 * k)) / k) if k > 0 else 2.0 * float(x) for x in u
+            float(-mpmath.log(1 + mpmath.mpf(float(x)) * mpmath.expm1(-2 * k)) / k) if k > 0 else 2.0 * float(x)
+            for x in u
         ]
     np.testing.assert_allclose(h, exact, rtol=1e-6)
 

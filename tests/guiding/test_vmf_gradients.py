@@ -120,9 +120,7 @@ def test_gradient_of_product_log_pdf(n_lobes, direction, other_kappa, log_kappa)
     other_kappa = np.full(N, float(np.float32(other_kappa)))
     found = evaluate(raw, w, direction, factor=3.0, other_mu=other_mu, other_kappa=other_kappa)
     at = found.kappa.astype(np.float64), found.mu
-    expected = 3.0 * oracle.gradient(
-        lambda m: oracle.product_log_pdf(m, w, other_mu, other_kappa), raw, direction, at
-    )
+    expected = 3.0 * oracle.gradient(lambda m: oracle.product_log_pdf(m, w, other_mu, other_kappa), raw, direction, at)
     bound = 3.0 * bounds(raw, direction, at, w, other_mu, other_kappa)
     error = np.abs(found.product_gradient - expected)
     assert np.all(error <= bound)
@@ -240,11 +238,10 @@ def test_a_network_learns_a_target_by_this_loss(direction):
     ones = np.ones((1024, 1), np.float32)
     target = np.zeros((1024, mixture.n_params), np.float32)
     divergences = []
-    for step in range(400):
-        if step in (0, 399):
+    for step in range(250):
+        if step in (0, 249):
             divergences.append(divergence(oracle.decode(model.inference(ones[:1]), direction))[0])
         target[:, :3], target[:, 3] = draw(1024, 1000 + step)
         model.train_step(ones, target, loss=mixture.kl_loss, report=False)
-    print(divergences)
     assert divergences[0] > 0.3
     assert divergences[1] < 0.02

@@ -1,7 +1,7 @@
 """Von Mises-Fisher lobes and mixtures in float64 NumPy and in mpmath, written apart from the kernels.
 
-Here a lobe is exp(s · w) / integral with s = kappa mu, and the integral 4 pi sinh(|s|) / |s|; angles are by dot products.
-In float64 that is exact to 1e-16 kappa.
+Here a lobe is exp(s · w) over its integral, 4 pi sinh(|s|) / |s|, with s = kappa mu, and angles are by dot products. In
+float64 that is exact to 1e-16 kappa.
 """
 
 from __future__ import annotations
