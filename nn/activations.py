@@ -32,9 +32,11 @@ def sigmoid(x: wp.float32):
 
 @wp.func
 def log1p(e: wp.float32):
-    """log(1 + e) for e >= 0, exact for small e (Kahan): the rounding of 1 + e cancels."""
+    """log(1 + e) for e > -1, exact for small e (Kahan): the rounding of 1 + e cancels."""
     u = 1.0 + e
-    return wp.where(u == 1.0, e, wp.log(u) * (e / wp.max(u - 1.0, 1.0e-30)))
+    if u == 1.0:
+        return e
+    return wp.log(u) * (e / (u - 1.0))
 
 
 @wp.func
