@@ -41,6 +41,15 @@ class Features:
     aovs: tuple[str, ...]  # arrays of the film that the first hit adds to, sorted
     variance: bool
 
+    # Path guiding
+    guide: tuple = ()  # what a guide says of its kernels; empty without a guide
+    guide_pdf: bool = True  # the guide has a density
+    records: tuple[str, ...] = ()  # fields of the records that the guide trains with; empty if it asks for none
+
+    @property
+    def guided(self) -> bool:
+        return bool(self.guide)
+
     @property
     def transmission(self) -> bool:
         """Whether a path can cross into another medium, so that radiance scales with the index of refraction."""
