@@ -316,13 +316,13 @@ def lobe_kernels(sampler: str, varied_share: bool):
 
     @wp.kernel(enable_backward=False, module="unique")
     def prepare(surfaces: Surfaces, guided: Queue, proposals: Proposals):
-        """Some vertices are declined, and some ask for what they do not get."""
+        """A quarter for some vertices, up to 1 for others, which are declined."""
         i = wp.tid()
         if i < queue_size(guided):
             slot = guided.slots[i]
             cell = cell_of(surfaces.position[slot])
             if wp.static(varied_share):
-                proposals.share[slot] = float(cell % 5) / 4.0
+                proposals.share[slot] = float(1 + cell % 4) / 4.0
 
     @wp.kernel(enable_backward=False, module="unique")
     def propose(
@@ -366,7 +366,7 @@ class LobeGuide(Guide):
     Args:
         axis: Of the cone, unit length.
         one_minus_cos: Of its half angle, up to 2.
-        varied_share: The share of BSDF sampling varies from 0 (raised to the least) to 1 over the vertices.
+        varied_share: The share of BSDF sampling varies from 1/4 to 1 over the vertices.
     """
 
     name = "lobe"
@@ -445,7 +445,7 @@ class MeanGuide(LobeGuide):
             kept = {name: array.copy() for name, array in host.items()}
             self.passes.append(kept | {"camera": records.camera.numpy().copy()})
         light = host["radiance"].sum(axis=1, dtype=np.float64) / host["pdf"] / host["survival"]
-        self.sum.assign(self.sum.numpy() + [*(light @ host["wi"].astype(np.float64)), records.count])
+        self.sum.assign(self.sum.numpy() + np.append(light @ host["wi"].astype(np.float64), records.count))
         self.point()
 
     def point(self):
@@ -465,4 +465,3 @@ class MeanGuide(LobeGuide):
 
     def statistics(self):
         return {"records": int(self.sum.numpy()[3])}
-

@@ -198,7 +198,7 @@ class Guide(ABC):
         empty, by name. They are written to a checkpoint, and filled in place by one."""
         return {}
 
-    def restored(self) -> None:
+    def restored(self) -> None:  # noqa: B027 (most guides have nothing to do)
         """Called after `arrays` were filled from a checkpoint."""
 
     def statistics(self) -> dict[str, Any]:

@@ -217,9 +217,8 @@ class Renderer:
         )
         if capacity < 1024:
             needed = held + film + 1024 * self.bytes_per_path * self.threads
-            rest = (
-                f", {film / 2**20:.0f} MiB of it for the film{' and the guide' if self.guide else ''} and {held / 2**20:.0f} MiB for all else" if held else ""
-            )
+            owner = "the film and the guide" if self.guide else "the film"
+            rest = f", {film / 2**20:.0f} MiB of it for {owner} and {held / 2**20:.0f} MiB for all else" if held else ""
             raise WavefrontError(
                 f"a memory budget of {memory / 2**20:.0f} MiB is too small for {pixels} pixels on {self.threads} "
                 f"threads; at least {math.ceil(needed / 2**20)} MiB is needed{rest}"

@@ -59,9 +59,7 @@ def make_direct(
             return
 
         # propose and evaluate
-        proposal = propose_light(
-            geometry, materials, textures, lights, paths, surfaces, slot, seed, counters[DEPTH]
-        )
+        proposal = propose_light(geometry, materials, textures, lights, paths, surfaces, slot, seed, counters[DEPTH])
         light = proposal.light
         bsdf = proposal.bsdf
         if bsdf.value[0] + bsdf.value[1] + bsdf.value[2] == 0.0:

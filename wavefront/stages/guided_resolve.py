@@ -124,9 +124,7 @@ def make_guided_resolve(
             row = record_row(rows, tile, slot)
             if row >= 0:
                 wo = -paths.direction[slot]
-                record_scattering(
-                    rows, row, depth, surfaces, slot, wo, wi, pdf, guide_pdf_at, weight, survival
-                )
+                record_scattering(rows, row, depth, surfaces, slot, wo, wi, pdf, guide_pdf_at, weight, survival)
         paths.beta[slot] = beta
         paths.direction[slot] = wi
         paths.pdf[slot] = pdf
