@@ -9,14 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warp as wp
 
 from tests.guides import HistogramGuide, LobeGuide, MeanGuide, ResamplingGuide
 from tools.image_test import Comparison, Estimate
 from wavefront import Renderer, WavefrontError, load_scene, renderer
 from wavefront.checkpoint import CheckpointError
 from wavefront.film import LUMINANCE
-from wavefront.guide import Guide
+from wavefront.guide import DIRECTIONS, LIGHTS, Guide, GuideState
+from wavefront.guided import GuidedWorker
 from wavefront.proposals import MIN_SHARE
+from wavefront.scene import description as d
 
 SCENES = Path(__file__).parent.parent / "scenes"
 CONE = {"axis": (0.6, 0.0, 0.8), "one_minus_cos": 0.3}
@@ -142,6 +145,20 @@ def test_a_guide_without_records_allocates_none():
     assert still.kernels.emission is learning.kernels.emission
 
 
+@pytest.mark.parametrize("nee", ["true", "false"])
+@pytest.mark.parametrize("guide", [HistogramGuide, MeanGuide, lambda: ResamplingGuide(1)])
+def test_bytes_per_path_are_what_is_allocated(guide, nee):
+    """The state of the guide itself included."""
+    r = Renderer(load("coloured-glass", f"integrator.nee={nee}"), threads=1, guide=guide())
+    w = r.workers[0]
+    structs = [w.paths, w.surfaces, w.shadow_rays, w.proposals, w.light_proposals, w.scratch]
+    arrays = [getattr(struct, name) for struct in structs for name in struct._cls.vars]
+    arrays += [queue.slots for queue in w.queues.queues.values()]
+    arrays += [array for array in vars(w.state).values() if isinstance(array, wp.array)]
+    allocated = sum(array.capacity for array in arrays if array is not None and array.size)
+    assert allocated == r.bytes_per_path * r.capacity
+
+
 # --- deterministic ---------------------------------------------------------------------------------------------------
 
 
@@ -164,6 +181,13 @@ def test_threads_and_tiles(monkeypatch, make_guide, single, threads, capacity):
     monkeypatch.setattr(renderer, "CPU_CAPACITY", capacity)
     r = Renderer(load("cornell-box", size=47), threads=threads, seed=5, guide=make_guide())
     assert r.capacity == capacity
+    np.testing.assert_array_equal(film(r, 8), single)
+
+
+def test_launches_that_do_not_know_the_length_of_queues(monkeypatch, make_guide, single):
+    """As on CUDA: every stage and the guide stop at what the device has counted."""
+    monkeypatch.setattr(GuidedWorker, "_threads", lambda self, queue: self.capacity)
+    r = Renderer(load("cornell-box", size=47), threads=1, seed=5, guide=make_guide())
     np.testing.assert_array_equal(film(r, 8), single)
 
 
@@ -198,6 +222,70 @@ def test_the_checkpoint_of_another_guide_is_refused(tmp_path, other, message):
     with pytest.raises(CheckpointError) as error:
         Renderer(scene, threads=1, guide=other).load_checkpoint(tmp_path / "c")
     assert message in str(error.value)
+
+
+# --- what a guide is asked -------------------------------------------------------------------------------------------
+
+
+class SpyState(GuideState):
+    """Does what another state does, and tells of it."""
+
+    def __init__(self, state, calls):
+        self.state, self.calls = state, calls
+
+    def note(self, queue, count, *what):
+        assert count == queue.count.numpy()[0] > 0
+        self.calls.append((*what, set(queue.slots.numpy()[:count].tolist())))
+
+    def prepare(self, guided, count):
+        self.note(guided, count, "prepare")
+        self.state.prepare(guided, count)
+
+    def propose(self, proposed, count, round):
+        self.note(proposed, count, "propose", round)
+        self.state.propose(proposed, count, round)
+
+    def evaluate(self, queue, count, directions, pdfs, purpose):
+        self.note(queue, count, "evaluate", purpose)
+        self.state.evaluate(queue, count, directions, pdfs, purpose)
+
+
+def spy_on(guide):
+    calls, make_state = [], guide.make_state
+    guide.make_state = lambda context: SpyState(make_state(context), calls)
+    return calls
+
+
+@pytest.mark.parametrize("nee", ["true", "false"])
+def test_the_order_of_a_bounce(nee):
+    """Two rounds, lights only where they are sampled, each question only for vertices that were prepared."""
+    guide = HistogramGuide()
+    calls = spy_on(guide)
+    film(Renderer(load("cornell-box", f"integrator.nee={nee}", "integrator.max_depth=4"), threads=1, guide=guide), 1)
+    lights = [("evaluate", LIGHTS)] if nee == "true" else []
+    bounce = [("prepare",), *lights, ("propose", 0), ("propose", 1), ("evaluate", DIRECTIONS)]
+    assert [call[:-1] for call in calls] == 3 * bounce
+    for k in range(0, len(calls), len(bounce)):
+        slots = {call[:-1]: call[-1] for call in calls[k : k + len(bounce)]}
+        assert all(found <= slots[("prepare",)] for found in slots.values())
+        assert slots["propose", 0] == slots["propose", 1] < slots["evaluate", DIRECTIONS]
+
+
+def test_a_guide_without_a_density_is_not_asked_for_one():
+    guide = ResamplingGuide(2)
+    calls = spy_on(guide)
+    film(Renderer(load("cornell-box"), threads=1, guide=guide), 1)
+    assert {call[0] for call in calls} == {"prepare", "propose"}
+
+
+def test_mirrors_need_no_guide():
+    guide = LobeGuide()
+    calls = spy_on(guide)
+    scene = load("material-conductor")
+    for shape in scene.shapes:
+        shape.bsdf = d.Conductor(material="Cu")
+    film(Renderer(scene, threads=1, guide=guide), 1)
+    assert not calls
 
 
 # --- what is refused -------------------------------------------------------------------------------------------------

@@ -42,7 +42,7 @@ class Features:
     variance: bool
 
     # Path guiding
-    guide: tuple = ()  # what a guide says of its kernels; empty without a guide
+    guide: tuple = ()  # name of the guide, and what tells its kernels from others of that name; empty without a guide
     guide_pdf: bool = True  # the guide has a density
     records: tuple[str, ...] = ()  # fields of the records that the guide trains with; empty if it asks for none
 

@@ -129,7 +129,7 @@ class Guide(ABC):
 
     Attributes:
         name: Of the method, for checkpoints and accounts.
-        key: Hashable values that tell this guide's kernels from those of others; part of `Features`.
+        key: Hashable values that tell this guide's kernels from those of other settings; with the name in `Features`.
         has_pdf: Whether the density of its directions is known. False for resampling.
         rounds: Calls of `GuideState.propose` per bounce, 1 or more.
         bsdf_share: Probability of sampling the BSDF where `GuideState.prepare` does not say otherwise; more than 0, at

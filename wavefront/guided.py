@@ -97,9 +97,9 @@ class GuidedWorker(Worker):
             "record_light": [shadow, tile, counters, paths, scratch, rows],
         }
         for stage, kernel in guided_kernels.items():
-            self._record(stage, kernel, inputs[stage])
+            self._command(stage, kernel, inputs[stage])
         if f.records:
-            self._record_apart(arguments["kernels"], f)
+            self._commands_apart(arguments["kernels"], f)
         self.state = guide.make_state(
             GuideContext(
                 device=self.device,
@@ -114,7 +114,7 @@ class GuidedWorker(Worker):
             )
         )
 
-    def _record_apart(self, kernels: Kernels, f: Features) -> None:
+    def _commands_apart(self, kernels: Kernels, f: Features) -> None:
         """The stages that add radiance, adding it to arrays of their own instead: the same kernels, given path states
         that share all arrays but some."""
         counters = wp.zeros_like(self.queues.counters)  # what they leave out is counted by those that add to the path
@@ -135,11 +135,11 @@ class GuidedWorker(Worker):
             for prefix, view in views.items():
                 inputs = [view if x is self.paths else x for x in self._arguments.get(stage, [])]
                 inputs = [counters if x is self.queues.counters else x for x in inputs]
-                self._record(f"record_{prefix}{stage}", getattr(kernels, stage), inputs)
+                self._command(f"record_{prefix}{stage}", getattr(kernels, stage), inputs)
         if kernels.shadow is not None:
             visible = apart(self.scratch.visible)
             inputs = [visible if x is self.paths else x for x in self._arguments["shadow"]]
-            self._record("record_shadow", kernels.shadow, inputs)
+            self._command("record_shadow", kernels.shadow, inputs)
 
     # --- the loop ------------------------------------------------------------------------------------------------
 

@@ -70,7 +70,7 @@ def make_features(scene: description.Scene, device_scene: DeviceScene, guide: Gu
         filter=filter_kind(scene.film),
         aovs=tuple(name for name in film_arrays(tuple(scene.film.aovs)) if name in FIRST_HIT),
         variance="variance" in scene.film.aovs,
-        guide=("guide", *guide.key) if guide is not None else (),
+        guide=(guide.name, *guide.key) if guide is not None else (),
         guide_pdf=guide is None or guide.has_pdf,
         records=guide.records.fields if guide is not None and guide.records is not None else (),
     )
@@ -78,7 +78,7 @@ def make_features(scene: description.Scene, device_scene: DeviceScene, guide: Gu
 
 @dataclasses.dataclass(frozen=True)
 class Kernels:
-    """The kernels of all stages; None where the scene needs no such stage. Those of a guided bounce are apart."""
+    """The kernels of all stages; None where there is no such stage. Guided bounces have more, see `wavefront.guided`."""
 
     generate: wp.Kernel
     intersect: wp.Kernel
@@ -258,9 +258,9 @@ class Worker:
         self.commands: dict[str, wp.Launch] = {}
         self._arguments: dict[str, list] = {}  # recorded commands do not keep their arrays alive
         for stage, inputs in arguments.items():
-            self._record(stage, getattr(kernels, stage), inputs)
+            self._command(stage, getattr(kernels, stage), inputs)
 
-    def _record(self, label: str, kernel: wp.Kernel | None, inputs: list) -> None:
+    def _command(self, label: str, kernel: wp.Kernel | None, inputs: list) -> None:
         """Makes a kernel with its arguments launchable by its label, if there is one."""
         if kernel is not None:
             self._arguments[label] = inputs
