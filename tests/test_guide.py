@@ -186,9 +186,12 @@ def test_threads_and_tiles(monkeypatch, make_guide, single, threads, capacity):
 
 def test_launches_that_do_not_know_the_length_of_queues(monkeypatch, make_guide, single):
     """As on CUDA: every stage and the guide stop at what the device has counted."""
+    dark = load("cornell-box", "integrator.nee=false")
+    expected = film(Renderer(dark, threads=1, seed=5, guide=make_guide()), 4)
     monkeypatch.setattr(GuidedWorker, "_threads", lambda self, queue: self.capacity)
     r = Renderer(load("cornell-box", size=47), threads=1, seed=5, guide=make_guide())
     np.testing.assert_array_equal(film(r, 8), single)
+    np.testing.assert_array_equal(film(Renderer(dark, threads=1, seed=5, guide=make_guide()), 4), expected)
 
 
 def test_interrupted(tmp_path, make_guide, single):

@@ -173,6 +173,12 @@ def test_every_kth_path():
         np.testing.assert_array_equal(passes[0][name], whole[name][chosen])
 
 
+@pytest.mark.parametrize("max_depth", [1, 2])
+def test_paths_that_do_not_scatter_leave_no_records(max_depth):
+    passes = check_recursion(load("cornell-box", f"integrator.max_depth={max_depth}"))
+    assert all((len(p["pdf"]) > 0) == (max_depth == 2) for p in passes)
+
+
 def test_no_light_no_harm():
     scene = furnace(True, 4)
     scene.shapes[0].emitter = None

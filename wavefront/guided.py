@@ -167,7 +167,7 @@ class GuidedWorker(Worker):
         self._launch("vertices", "hits")
         self._ask("prepare", "guided")
         self._launch("direct", "guided")
-        if self.guide.has_pdf:
+        if self.guide.has_pdf and "light" in self.commands:
             self._ask("evaluate", "lit", self.light_proposals.wi, self.light_proposals.guide_pdf, LIGHTS)
         self._launch("light", "lit")
         if self.recording:

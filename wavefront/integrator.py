@@ -78,7 +78,7 @@ def make_features(scene: description.Scene, device_scene: DeviceScene, guide: Gu
 
 @dataclasses.dataclass(frozen=True)
 class Kernels:
-    """The kernels of all stages; None where there is no such stage. Guided bounces have more, see `wavefront.guided`."""
+    """The kernels of all stages; None where there is no such stage. `wavefront.guided` has more."""
 
     generate: wp.Kernel
     intersect: wp.Kernel

@@ -340,6 +340,8 @@ class Recorder:
 
     def _space(self, name: str, count: int) -> wp.array:
         """`count` entries for a field."""
+        if count == 0:
+            return wp.empty(0, dtype=FIELDS[name], device=self.device)
         array = self._storage.get(name)
         if array is None or array.shape[0] < count:
             array = self._storage[name] = wp.empty(count, dtype=FIELDS[name], device=self.device)
