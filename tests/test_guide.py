@@ -137,6 +137,19 @@ def test_nothing_of_guiding_without_a_guide():
     assert guided.kernels.scatter is guided.kernels.direct is None
 
 
+def test_what_is_seen_through_a_mask_keeps_its_samples():
+    """A surface that is not there declines its vertices: bit for bit what an unguided render gives."""
+    scene = load("material-conductor")
+    for shape in scene.shapes:
+        shape.bsdf = d.Mask(bsdf=d.TwoSided(front=d.Diffuse()), opacity=0.0)
+    guide = LobeGuide()
+    calls = spy_on(guide)
+    image = film(Renderer(scene, threads=1, guide=guide), 2)
+    np.testing.assert_array_equal(image, film(Renderer(scene, threads=1), 2))
+    assert image.max() > 0.0
+    assert not calls
+
+
 def test_a_guide_without_records_allocates_none():
     learning = Renderer(load("cornell-box"), threads=1, guide=MeanGuide())
     still = Renderer(load("cornell-box"), threads=1, guide=LobeGuide())

@@ -56,6 +56,11 @@ class Features:
         return any(kind in self.bsdfs for kind in ("dielectric", "rough_dielectric", "principled_transmissive"))
 
     @property
+    def mixed_deltas(self) -> bool:
+        """Whether a surface may have both delta directions and others."""
+        return self.mask or any(kind in self.bsdfs for kind in ("plastic", *BLENDS))
+
+    @property
     def smooth_bsdfs(self) -> bool:
         """Whether a light sample can contribute anywhere."""
         return any(kind not in (*DELTA, *BLENDS) for kind in self.bsdfs)

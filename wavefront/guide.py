@@ -18,7 +18,8 @@ never asks which method it runs. A guided bounce is (`wavefront.guided`)
 
 Delta directions are left to the BSDF. With p = share p_bsdf + (1 - share) p_guide the weight of any other direction is
 f |cos| / p whichever technique it came from, and that of a delta its weight by the BSDF over `share`. p is also what
-light sampling is weighted against. See `wavefront.proposals` for guides without a density.
+light sampling is weighted against. See `wavefront.proposals` for guides without a density, and for how `share` makes up
+for deltas.
 
 Everything here is in world space. Device functions draw random numbers with `SAMPLERS[features.sampler]` from
 `wavefront.sampler`, for (seed, paths.pixel[slot], paths.sample[slot], counters[DEPTH], purpose) with a purpose from
@@ -94,8 +95,8 @@ class GuideState(ABC):
         """Parameters of the vertices of `guided`, from position, direction and material, into buffers of the state.
 
         They must stay valid until the bounce ends. May write `proposals.share[slot]`: the probability of sampling the
-        BSDF at this vertex, of which the guide's `bsdf_share` is there already. 1 declines the vertex: nothing of the
-        guide is used for it. Values below `proposals.MIN_SHARE` are raised to it.
+        BSDF at this vertex if it had no deltas, where the guide's `bsdf_share` is already. 1 declines the vertex:
+        nothing of the guide is used for it. Values below `proposals.MIN_SHARE` are raised to it.
         """
 
     @abstractmethod

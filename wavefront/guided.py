@@ -24,7 +24,7 @@ from wavefront.stages.guided_light import make_guided_light
 from wavefront.stages.guided_propose import make_guided_propose
 from wavefront.stages.guided_record import make_record_arrivals, put_throughput_aside, record_direct_light
 from wavefront.stages.guided_resolve import make_guided_resolve
-from wavefront.stages.guided_vertices import queue_guided_vertices
+from wavefront.stages.guided_vertices import make_guided_vertices
 
 
 def make_guided_kernels(f: Features) -> dict[str, wp.Kernel]:
@@ -32,14 +32,16 @@ def make_guided_kernels(f: Features) -> dict[str, wp.Kernel]:
     bsdf = f.bsdfs, f.mask, f.textures
     frame = f.uvs, f.tangents, f.maps
     kernels = {
-        "vertices": queue_guided_vertices,
-        "propose": make_guided_propose(*bsdf, *frame, f.transmission, f.sampler),
+        "vertices": make_guided_vertices(*bsdf, f.uvs, f.mixed_deltas),
+        "propose": make_guided_propose(*bsdf, *frame, f.transmission, f.sampler, f.mixed_deltas),
         "directions": make_guided_evaluate(*bsdf, *frame, f.transmission),
-        "resolve": make_guided_resolve(f.transmission, f.roulette, f.media, f.sampler, f.guide_pdf, f.records),
+        "resolve": make_guided_resolve(
+            f.transmission, f.roulette, f.media, f.sampler, f.mixed_deltas, f.guide_pdf, f.records
+        ),
     }
     if f.light_sampling:
         kernels["direct"] = make_guided_direct(*bsdf, f.lights, f.light_textures, *frame, f.media, f.sampler)
-        kernels["light"] = make_guided_light(f.guide_pdf, bool(f.records))
+        kernels["light"] = make_guided_light(f.mixed_deltas, f.guide_pdf, bool(f.records))
     if f.records:
         kernels["put_aside"] = put_throughput_aside
         kernels["record_arrivals"] = make_record_arrivals(f.light_sampling and "taken" in f.records)
@@ -86,7 +88,7 @@ class GuidedWorker(Worker):
         tables = geometry, materials, textures, lights
         rr_depth = scene.integrator.rr_depth or 0
         inputs = {
-            "vertices": [materials, paths, surfaces, hits, guide.bsdf_share, proposals, guided, counters],
+            "vertices": [materials, textures, paths, surfaces, hits, guide.bsdf_share, proposals, guided, counters],
             "direct": [*tables, paths, surfaces, guided, seed, light_proposals, shadow_rays, lit, counters],
             "light": [paths, proposals, light_proposals, lit, shadow_rays, scratch, shadow, counters],
             "propose": [materials, textures, paths, surfaces, hits, seed, proposals, proposed, smooth, counters],

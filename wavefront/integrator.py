@@ -160,7 +160,7 @@ def skipped_guided_arrays(f: Features) -> dict[type, tuple[str, ...]]:
     scratch = scratch_arrays(f.records, f.light_sampling)
     lights = () if f.guide_pdf else ("guide_pdf",)
     return {
-        Proposals: () if f.transmission else ("eta",),
+        Proposals: (() if f.transmission else ("eta",)) + (() if f.mixed_deltas else ("delta",)),
         LightProposals: lights if f.light_sampling else tuple(LightProposals.vars),
         RecordScratch: tuple(name for name in RecordScratch.vars if name not in scratch),
     }

@@ -1,8 +1,13 @@
 """What is proposed at the vertices of a guided bounce, before a direction is chosen; how the techniques combine.
 
-At a vertex there are two techniques for the next direction: the BSDF with probability `share`, and the guide with what
-is left. The direction is one sample of their mixture (Veach 1997, section 9.2.4: one-sample multiple importance
-sampling with the balance heuristic).
+At a vertex there are two techniques for the next direction: the BSDF with some probability, its share, and the guide
+with what is left. The direction is one sample of their mixture (Veach 1997, section 9.2.4: one-sample multiple
+importance sampling with the balance heuristic).
+
+Delta directions are left to the BSDF. They are all that is seen through a mask, or in a coating, and a guide should not
+take their samples. So with d the probability that a BSDF sample is a delta, and s what the guide asks for, the share of
+the BSDF is s + (1 - s) d: the guide gets a fraction 1 - s of the samples that would be no deltas. As d depends on
+nothing that is sampled at the vertex, the result is unbiased for any d.
 """
 
 from __future__ import annotations
@@ -20,7 +25,8 @@ TECHNIQUE_GUIDE = wp.constant(1)
 class Proposals:
     """The vertex's proposal for the next direction, one entry per slot."""
 
-    share: wp.array[wp.float32]  # probability of sampling the BSDF; 1 where a guide has no say
+    share: wp.array[wp.float32]  # that the guide asks for; 1 where a guide has no say
+    delta: wp.array[wp.float32]  # probability of a delta; allocated if a surface may have those and other directions
     technique: wp.array[wp.int32]
     wi: wp.array[wp.vec3]  # unit length; a guide that has none to offer proposes zero, which ends the path
     weight: wp.array[wp.vec3]  # of the BSDF: its sample's f |cos| / pdf; of the guide: f |cos|
@@ -40,13 +46,26 @@ class LightProposals:
     guide_pdf: wp.array[wp.float32]  # allocated if the guide has a density
 
 
-@wp.func
-def bsdf_share(proposals: Proposals, slot: int) -> float:
-    """The probability of sampling the BSDF: what the guide asked for, in [MIN_SHARE, 1]; MIN_SHARE for NaN."""
-    share = proposals.share[slot]
-    if not share >= MIN_SHARE:
-        return MIN_SHARE
-    return wp.min(share, 1.0)
+@functools.cache
+def make_bsdf_share(mixed_deltas: bool):
+    """`bsdf_share(proposals, slot) -> float`: the probability of sampling the BSDF, from what the guide asks for in
+    [MIN_SHARE, 1] (MIN_SHARE for NaN).
+
+    Args:
+        mixed_deltas: Property of `Features`.
+    """
+
+    @wp.func
+    def bsdf_share(proposals: Proposals, slot: int) -> float:
+        share = proposals.share[slot]
+        if not share >= MIN_SHARE:
+            share = MIN_SHARE
+        share = wp.min(share, 1.0)
+        if wp.static(mixed_deltas):
+            share += (1.0 - share) * proposals.delta[slot]
+        return share
+
+    return bsdf_share
 
 
 @functools.cache

@@ -7,20 +7,20 @@ import functools
 import warp as wp
 
 from wavefront.light.mis import power_heuristic
-from wavefront.proposals import LightProposals, Proposals, bsdf_share, make_scatter_pdf
+from wavefront.proposals import LightProposals, Proposals, make_bsdf_share, make_scatter_pdf
 from wavefront.queues import NONFINITE_DIRECT, Paths, Queue, ShadowRays, push, queue_size
 from wavefront.recording import RecordScratch
 
 
 @functools.cache
-def make_guided_light(guide_pdf: bool, recorded: bool):
+def make_guided_light(mixed_deltas: bool, guide_pdf: bool, recorded: bool):
     """Kernel of the stage.
 
     Args:
-        guide_pdf: Field of `Features`.
+        mixed_deltas, guide_pdf: Of `Features`.
         recorded: Whether there are records, which need the light without the throughput.
     """
-    scatter_pdf = make_scatter_pdf(guide_pdf)
+    bsdf_share, scatter_pdf = make_bsdf_share(mixed_deltas), make_scatter_pdf(guide_pdf)
 
     @wp.kernel(enable_backward=False, module="unique")
     def weight_light_samples(

@@ -10,7 +10,7 @@ import warp as wp
 from wavefront.bsdf.dispatch import make_bsdf
 from wavefront.bsdf.frame import make_frame
 from wavefront.bsdf.tables import MaterialTables
-from wavefront.proposals import TECHNIQUE_BSDF, TECHNIQUE_GUIDE, Proposals, bsdf_share
+from wavefront.proposals import TECHNIQUE_BSDF, TECHNIQUE_GUIDE, Proposals, make_bsdf_share
 from wavefront.queues import DEPTH, Paths, Queue, Surfaces, push, queue_size
 from wavefront.rng import PURPOSE_BSDF, PURPOSE_TECHNIQUE
 from wavefront.sampler import SAMPLERS
@@ -27,11 +27,13 @@ def make_guided_propose(
     maps: tuple[str, ...],
     transmission: bool,
     sampler: str,
+    mixed_deltas: bool,
 ):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
     _, sample_bsdf, _ = make_bsdf(bsdfs, mask, textures, tangents, bool(maps))
     frame_at, _ = make_frame(tangents, bool(maps))
     draw = SAMPLERS[sampler]
+    bsdf_share = make_bsdf_share(mixed_deltas)
 
     @wp.kernel(enable_backward=False, module="unique")
     def propose_directions(

@@ -8,7 +8,7 @@ import functools
 import warp as wp
 
 from wavefront.medium import medium_towards
-from wavefront.proposals import TECHNIQUE_GUIDE, Proposals, bsdf_share, make_scatter_pdf
+from wavefront.proposals import TECHNIQUE_GUIDE, Proposals, make_bsdf_share, make_scatter_pdf
 from wavefront.queues import DEPTH, NONFINITE_SCATTER, Paths, Queue, Surfaces, push, queue_size
 from wavefront.recording import Rows, record_row
 from wavefront.rng import PURPOSE_BSDF
@@ -19,11 +19,17 @@ from wavefront.surface import spawn_origin
 
 @functools.cache
 def make_guided_resolve(
-    transmission: bool, roulette: bool, media: bool, sampler: str, guide_pdf: bool, records: tuple[str, ...]
+    transmission: bool,
+    roulette: bool,
+    media: bool,
+    sampler: str,
+    mixed_deltas: bool,
+    guide_pdf: bool,
+    records: tuple[str, ...],
 ):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
     draw = SAMPLERS[sampler]
-    scatter_pdf = make_scatter_pdf(guide_pdf)
+    bsdf_share, scatter_pdf = make_bsdf_share(mixed_deltas), make_scatter_pdf(guide_pdf)
 
     @wp.func
     def record_scattering(
