@@ -7,10 +7,13 @@ import dataclasses
 import pytest
 import warp as wp
 
+from tests.guides import histogram_kernels, lobe_kernels, resampling_kernel
 from wavefront.bsdf.tables import KINDS
 from wavefront.features import Features
 from wavefront.film import FIRST_HIT
+from wavefront.guided import make_guided_kernels
 from wavefront.integrator import make_kernels
+from wavefront.recording import FIELDS, make_gather
 from wavefront.stages.inspect import make_inspect_hit, make_inspect_light
 
 CORNELL_BOX = Features(
@@ -117,6 +120,27 @@ def test_kernels_that_draw_sobol_points_compile_for_cuda(tmp_path):
     assert compile_modules(modules, 90, tmp_path) == built(tmp_path) == 3
 
 
+def guided_modules(features: Features) -> list:
+    """Modules of the stages that only guided bounces have, with all that records can hold and with none."""
+    kernels = []
+    for records in ((), tuple(FIELDS)):
+        for guide_pdf in (True, False):
+            guided = dataclasses.replace(features, guide=("any",), guide_pdf=guide_pdf, records=records)
+            kernels += [*make_guided_kernels(guided).values(), make_kernels(guided).advance]
+    kernels += make_gather(tuple(FIELDS))
+    return list(dict.fromkeys(kernel.module for kernel in kernels))
+
+
+def test_kernels_of_a_guided_bounce_compile_for_cuda(tmp_path):
+    """Those of guides too."""
+    modules = guided_modules(CORNELL_BOX)
+    kernels = [*histogram_kernels("independent"), *lobe_kernels("independent", True)]
+    bsdf = CORNELL_BOX.bsdfs, CORNELL_BOX.mask, CORNELL_BOX.textures
+    kernels.append(resampling_kernel(3, True, bsdf, False, False, False, "independent"))
+    modules += [kernel.module for kernel in kernels]
+    assert compile_modules(modules, 90, tmp_path) == built(tmp_path)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("arch", [80, 90])
 def test_all_feature_sets_compile_for_cuda(tmp_path, arch):
@@ -125,6 +149,7 @@ def test_all_feature_sets_compile_for_cuda(tmp_path, arch):
     for change in CHANGES:
         features = dataclasses.replace(EVERYTHING, **change)
         modules += make_kernels(features).modules() + inspectors(features)
+    modules += guided_modules(EVERYTHING)
     modules = list(dict.fromkeys(modules))
     compile_modules(modules, arch, tmp_path)
     assert built(tmp_path) == len(modules)

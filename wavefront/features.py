@@ -41,10 +41,24 @@ class Features:
     aovs: tuple[str, ...]  # arrays of the film that the first hit adds to, sorted
     variance: bool
 
+    # Path guiding
+    guide: tuple = ()  # name of the guide, and what tells its kernels from others of that name; empty without a guide
+    guide_pdf: bool = True  # the guide has a density
+    records: tuple[str, ...] = ()  # fields of the records that the guide trains with; empty if it asks for none
+
+    @property
+    def guided(self) -> bool:
+        return bool(self.guide)
+
     @property
     def transmission(self) -> bool:
         """Whether a path can cross into another medium, so that radiance scales with the index of refraction."""
         return any(kind in self.bsdfs for kind in ("dielectric", "rough_dielectric", "principled_transmissive"))
+
+    @property
+    def mixed_deltas(self) -> bool:
+        """Whether a surface may have both delta directions and others."""
+        return self.mask or any(kind in self.bsdfs for kind in ("plastic", *BLENDS))
 
     @property
     def smooth_bsdfs(self) -> bool:

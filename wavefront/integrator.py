@@ -21,11 +21,14 @@ from wavefront.camera import camera_kind, make_camera
 from wavefront.errors import WavefrontError
 from wavefront.features import Features
 from wavefront.film import FIRST_HIT, Film, film_arrays, make_window
+from wavefront.guide import Guide
+from wavefront.proposals import LightProposals, Proposals
 from wavefront.queues import Paths, QueueSet, ShadowRays, Surfaces, allocate_struct, bytes_per_slot
+from wavefront.recording import RecordScratch, scratch_arrays
 from wavefront.scene import description
 from wavefront.scene.device import DeviceScene
 from wavefront.stages.accumulate import make_accumulate
-from wavefront.stages.advance import advance_bounce, drain_rays
+from wavefront.stages.advance import advance_bounce, advance_guided_bounce, drain_rays
 from wavefront.stages.aov import make_aov
 from wavefront.stages.direct import make_direct
 from wavefront.stages.emission import make_emission
@@ -43,8 +46,8 @@ def filter_kind(film: description.Film) -> str:
     return type(film.filter).__struct_config__.tag
 
 
-def make_features(scene: description.Scene, device_scene: DeviceScene) -> Features:
-    """What the kernels for a scene and its settings must do, and no more."""
+def make_features(scene: description.Scene, device_scene: DeviceScene, guide: Guide | None = None) -> Features:
+    """What the kernels for a scene, its settings and a guide must do, and no more."""
     integrator = scene.integrator
     return Features(
         triangles=bool(device_scene.geometry.mesh),
@@ -67,12 +70,15 @@ def make_features(scene: description.Scene, device_scene: DeviceScene) -> Featur
         filter=filter_kind(scene.film),
         aovs=tuple(name for name in film_arrays(tuple(scene.film.aovs)) if name in FIRST_HIT),
         variance="variance" in scene.film.aovs,
+        guide=(guide.name, *guide.key) if guide is not None else (),
+        guide_pdf=guide is None or guide.has_pdf,
+        records=guide.records.fields if guide is not None and guide.records is not None else (),
     )
 
 
 @dataclasses.dataclass(frozen=True)
 class Kernels:
-    """The kernels of all stages; None where the scene needs no such stage."""
+    """The kernels of all stages; None where there is no such stage. `wavefront.guided` has more."""
 
     generate: wp.Kernel
     intersect: wp.Kernel
@@ -83,7 +89,7 @@ class Kernels:
     direct: wp.Kernel | None
     shadow: wp.Kernel | None
     drain: wp.Kernel
-    scatter: wp.Kernel
+    scatter: wp.Kernel | None
     advance: wp.Kernel
     accumulate: wp.Kernel
 
@@ -116,14 +122,16 @@ def make_kernels(f: Features) -> Kernels:
         direct=make_direct(
             f.bsdfs, f.mask, f.textures, f.lights, f.light_textures, f.uvs, f.tangents, f.maps, f.media, f.sampler
         )
-        if f.light_sampling
+        if f.light_sampling and not f.guided
         else None,
         shadow=make_shadow(f.triangles, f.spheres, f.instances) if f.light_sampling else None,
         drain=drain_rays,
         scatter=make_scatter(
             f.bsdfs, f.mask, f.textures, f.uvs, f.tangents, f.maps, f.transmission, f.roulette, f.media, f.sampler
-        ),
-        advance=advance_bounce,
+        )
+        if not f.guided
+        else None,
+        advance=advance_guided_bounce if f.guided else advance_bounce,
         accumulate=make_accumulate(f.variance),
     )
 
@@ -147,15 +155,35 @@ def skipped_arrays(f: Features) -> dict[type, tuple[str, ...]]:
     }
 
 
+def skipped_guided_arrays(f: Features) -> dict[type, tuple[str, ...]]:
+    """Arrays of the state of a guided bounce that the features do without."""
+    scratch = scratch_arrays(f.records, f.light_sampling)
+    lights = () if f.guide_pdf else ("guide_pdf",)
+    return {
+        Proposals: (() if f.transmission else ("eta",)) + (() if f.mixed_deltas else ("delta",)),
+        LightProposals: lights if f.light_sampling else tuple(LightProposals.vars),
+        RecordScratch: tuple(name for name in RecordScratch.vars if name not in scratch),
+    }
+
+
 def queue_names(f: Features) -> tuple[str, ...]:
     """Queues that the features need."""
-    needed = {"escaped": bool(f.escape_lights), "emissive": f.area_lights, "shadow": f.light_sampling}
+    needed = {
+        "escaped": bool(f.escape_lights),
+        "emissive": f.area_lights,
+        "shadow": f.light_sampling,
+        "guided": f.guided,
+        "lit": f.guided and f.light_sampling,
+        "proposed": f.guided,
+        "smooth": f.guided,
+    }
     return ("rays", "hits", *(name for name, used in needed.items() if used))
 
 
 def state_bytes_per_slot(f: Features) -> int:
     """Memory of one path in flight."""
-    structs = sum(bytes_per_slot(struct, skip) for struct, skip in skipped_arrays(f).items())
+    skipped = skipped_arrays(f) | (skipped_guided_arrays(f) if f.guided else {})
+    structs = sum(bytes_per_slot(struct, skip) for struct, skip in skipped.items())
     return structs + 4 * len(queue_names(f))
 
 
@@ -202,7 +230,9 @@ class Worker:
         self.paths, self.surfaces, self.shadow_rays = paths, surfaces, shadow_rays
         geometry, materials = device_scene.geometry, device_scene.materials
         textures, lights = device_scene.textures, device_scene.lights
-        rays, hits, escaped, emissive, shadow = (self.queues[name] for name in QueueSet.INDEX)
+        rays, hits, escaped, emissive, shadow = (
+            self.queues[name] for name in ("rays", "hits", "escaped", "emissive", "shadow")
+        )
         counters, totals, tile = self.queues.counters, self.queues.totals, self.tile
         camera, window = make_camera(scene.camera, scene.film), make_window(scene.film)
         scale = FILTER_SCALES[features.filter](scene.film.filter)
@@ -225,28 +255,37 @@ class Worker:
             "advance": [counters],
             "accumulate": [paths, tile, stride, sums, counters],
         }
-        self.commands = {
-            stage: wp.launch(kernel, dim=capacity, inputs=arguments[stage], device=device, record_cmd=True)
-            for stage in arguments
-            if (kernel := getattr(kernels, stage)) is not None
-        }
-        self._arguments = arguments  # recorded commands do not keep their arrays alive
+        self.commands: dict[str, wp.Launch] = {}
+        self._arguments: dict[str, list] = {}  # recorded commands do not keep their arrays alive
+        for stage, inputs in arguments.items():
+            self._command(stage, getattr(kernels, stage), inputs)
+
+    def _command(self, label: str, kernel: wp.Kernel | None, inputs: list) -> None:
+        """Makes a kernel with its arguments launchable by its label, if there is one."""
+        if kernel is not None:
+            self._arguments[label] = inputs
+            self.commands[label] = wp.launch(
+                kernel, dim=self.capacity, inputs=inputs, device=self.device, record_cmd=True
+            )
 
     # --- the loop ------------------------------------------------------------------------------------------------
 
     def trace_tile(self, tile: Tile) -> None:
         """Traces all paths of a tile and adds them to the film."""
-        fields = np.array(dataclasses.astuple(tile), np.int32)
-        if self.device == "cpu":
-            self.tile.numpy()[:] = fields
-        else:
-            self.tile.assign(fields)
+        self._set_tile(tile)
         if self.device == "cpu" or self.profile:
             self._trace(tile)
             return
         if self.captured is None:
             self.captured = self.capture()
         wp.capture_launch(self.captured)
+
+    def _set_tile(self, tile: Tile) -> None:
+        fields = np.array(dataclasses.astuple(tile), np.int32)
+        if self.device == "cpu":
+            self.tile.numpy()[:] = fields
+        else:
+            self.tile.assign(fields)
 
     def capture(self):
         """Records a pass, whatever its tile, as one graph that runs without the host."""
@@ -283,13 +322,21 @@ class Worker:
         if command is None:
             return
         if isinstance(size, str):
-            exact = self.device == "cpu" and not self.capturing
-            size = self.queues.count(size) if exact else self.capacity
+            size = self._threads(size)
         if size == 0:
             return
         command.set_dim(min(size, self.capacity))
         start = time.perf_counter()
         command.launch()
+        self._clock(stage, start)
+
+    def _threads(self, queue: str) -> int:
+        """Threads for the entries of a queue, which a stage counts itself."""
+        exact = self.device == "cpu" and not self.capturing
+        return min(self.queues.count(queue), self.capacity) if exact else self.capacity
+
+    def _clock(self, stage: str, start: float) -> None:
+        """Adds the time since `start` to that of a stage, if it is known."""
         if self.device != "cpu":
             if not self.profile:
                 return

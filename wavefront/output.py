@@ -159,7 +159,7 @@ def describe_render(renderer: Renderer, source: str, started: float, preset: dic
         "bytes_per_path": renderer.bytes_per_path,
         "paths_in_flight": renderer.capacity * renderer.threads,
         "warnings": renderer.warnings,
-    }
+    } | ({"guide": {"name": renderer.guide.name} | renderer.guide.statistics()} if renderer.guide else {})
 
 
 def write_film(exr: Path, renderer: Renderer, half: bool) -> None:

@@ -24,7 +24,11 @@ NONFINITE_ESCAPED = wp.constant(9)
 NONFINITE_DIRECT = wp.constant(10)
 NONFINITE_SCATTER = wp.constant(11)
 NONFINITE_ACCUMULATE = wp.constant(12)
-COUNTER_COUNT = 13
+GUIDED = wp.constant(13)  # counts of the queues of a guided bounce
+LIT = wp.constant(14)
+PROPOSED = wp.constant(15)
+SMOOTH = wp.constant(16)
+COUNTER_COUNT = 17
 NONFINITE_STAGES = {"emission": 8, "escaped": 9, "direct": 10, "scatter": 11, "accumulate": 12}
 
 STATUS_QUEUE_OVERFLOW = wp.constant(1)
@@ -135,7 +139,17 @@ class QueueSet:
         names: Queues to allocate; the others are empty and must not be pushed to.
     """
 
-    INDEX = {"rays": 0, "hits": 1, "escaped": 2, "emissive": 3, "shadow": 4}
+    INDEX = {
+        "rays": 0,
+        "hits": 1,
+        "escaped": 2,
+        "emissive": 3,
+        "shadow": 4,
+        "guided": 13,
+        "lit": 14,
+        "proposed": 15,
+        "smooth": 16,
+    }
 
     def __init__(self, capacity: int, device: str, names: tuple[str, ...]):
         self.capacity = capacity

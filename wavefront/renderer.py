@@ -18,6 +18,8 @@ import wavefront
 from wavefront.checkpoint import CheckpointError, film_sections, read_checkpoint, write_checkpoint
 from wavefront.errors import WavefrontError
 from wavefront.film import BLOCK_PIXELS, CHANNELS, Film
+from wavefront.guide import Guide, check_guide
+from wavefront.guided import Guiding
 from wavefront.identity import scene_records
 from wavefront.integrator import (
     Worker,
@@ -112,12 +114,14 @@ class Renderer:
             writing the film takes come off it.
         seed: Of the random numbers. Same seed and device, same image.
         strict: A contribution that is not finite or negative is an error that names the path; else it is counted.
+        guide: Of the directions of paths, see `wavefront.guide`.
         profile: On CUDA, time every stage, at the price of a synchronisation after each.
         on_compile: Called with a message before kernels are compiled.
 
     Raises:
         SceneError: The scene cannot be rendered.
-        WavefrontError: Unknown device, or a budget that is too small.
+        WavefrontError: Unknown device, a budget that is too small, or a guide with settings out of range or in a strict
+            render.
     """
 
     def __init__(
@@ -131,18 +135,29 @@ class Renderer:
         strict: bool = False,
         profile: bool = False,
         on_compile: Callable[[str], None] | None = None,
+        guide: Guide | None = None,
     ):
         if not 0 <= seed < 2**64:
             raise WavefrontError(f"seed {seed} is out of range; allowed: 0 to 2^64 - 1")
         if threads is not None and threads < 1:
             raise WavefrontError(f"{threads} threads; allowed: 1 or more")
+        if guide is not None:
+            check_guide(guide)
+            if strict:
+                raise WavefrontError(
+                    f"a strict render traces paths again, which a guide that has learned since would not repeat; "
+                    f"allowed: a guide ({guide.name}) or a strict render"
+                )
         scene = checked(scene)  # a scene built in Python gets the checks that a file gets, and a copy is kept
         self.warnings = validate(scene)
         self.scene, self.device, self.seed, self.strict = scene, resolve_device(device), seed, strict
         self.device_scene = upload_scene(scene, self.device)
         self.warnings += self.device_scene.notes
-        self.features = make_features(scene, self.device_scene)
+        self.features = make_features(scene, self.device_scene, guide)
         self.kernels = make_kernels(self.features)
+        self.guide, self._guiding = guide, None
+        if guide is not None:
+            self._guiding = Guiding(guide, scene, self.device_scene, self.features, self.device)
         self.statistics = Statistics()
         self._trace_worker: TraceWorker | None = None
         self._resumed = Statistics()  # what the statistics were in the checkpoint that was loaded
@@ -153,14 +168,15 @@ class Renderer:
         self.threads = (threads or available or 1) if self.device == "cpu" else 1
         window, aovs = film.window, tuple(film.aovs)
         self.bytes_per_pixel = Film.bytes_per_pixel(aovs)
-        self.bytes_per_path = state_bytes_per_slot(self.features)
+        self.bytes_per_path = state_bytes_per_slot(self.features) + (guide.bytes_per_slot() if guide else 0)
         pixels, held = window.width * window.height, 0
         if whole_process and self.device == "cpu":
             held = max(resident_bytes() + output_bytes(aovs), peak_memory_bytes() - pixels * self.bytes_per_pixel)
         self.capacity = self._plan_capacity(memory, held, pixels)
         self.film = Film(window.width, window.height, aovs, self.device, bsdf_of_shape(scene))
+        make_worker = self._guiding.make_worker if self._guiding else Worker
         self.workers = [
-            Worker(
+            make_worker(
                 scene=scene,
                 device_scene=self.device_scene,
                 features=self.features,
@@ -177,6 +193,8 @@ class Renderer:
     def _compile(self, on_compile) -> None:
         start = time.perf_counter()
         modules = self.kernels.modules()
+        if self._guiding:
+            modules = list(dict.fromkeys(modules + self._guiding.modules()))
         if on_compile:
             on_compile(f"compiling {len(modules)} kernels for {self.device} (cached for the next time)")
         # Modules share functions, and what a module is hashed to depends on whether another that shares a function has
@@ -192,16 +210,15 @@ class Renderer:
         """Paths in flight per worker, from the memory budget, of which some is held already."""
         if pixels > 2**31 - 1:
             raise WavefrontError(f"a film of {pixels} pixels; allowed: up to 2^31 - 1")
-        film = pixels * self.bytes_per_pixel
+        film = pixels * self.bytes_per_pixel + (self._guiding.nbytes() if self._guiding else 0)
         left = memory - held - film
         capacity = min(
             CPU_CAPACITY if self.device == "cpu" else CUDA_CAPACITY, left // (self.bytes_per_path * self.threads)
         )
         if capacity < 1024:
             needed = held + film + 1024 * self.bytes_per_path * self.threads
-            rest = (
-                f", {film / 2**20:.0f} MiB of it for the film and {held / 2**20:.0f} MiB for all else" if held else ""
-            )
+            owner = "the film and the guide" if self.guide else "the film"
+            rest = f", {film / 2**20:.0f} MiB of it for {owner} and {held / 2**20:.0f} MiB for all else" if held else ""
             raise WavefrontError(
                 f"a memory budget of {memory / 2**20:.0f} MiB is too small for {pixels} pixels on {self.threads} "
                 f"threads; at least {math.ceil(needed / 2**20)} MiB is needed{rest}"
@@ -243,6 +260,7 @@ class Renderer:
             spp = self.scene.integrator.spp if seconds is None else 2**31 - 1 - self.sample_count
         if self.sample_count + spp > 2**31 - 1:
             raise WavefrontError("more than 2^31 - 1 samples per pixel")
+        training = False
         begin = time.perf_counter()
         elapsed_before = self.statistics.render_seconds
         target = self.sample_count + spp
@@ -250,7 +268,12 @@ class Renderer:
         while self.sample_count < target:
             samples = min(samples, target - self.sample_count)
             pass_start = time.perf_counter()
-            self._pass(samples)
+            if self._guiding:
+                spent = elapsed_before + pass_start - begin
+                progress = self.sample_count / target if seconds is None else spent / (elapsed_before + seconds)
+                training = self._guiding.trains(progress)
+                samples = 1 if training else samples
+            self._pass(samples, training)
             now = time.perf_counter()
             self.statistics.render_seconds = elapsed_before + now - begin
             if callback is not None and callback(self):
@@ -284,7 +307,11 @@ class Renderer:
             "device": self.device.split(":")[0],
             "seed": self.seed,
             "scene": self.scene_records,
-        }
+        } | ({"guide": {"name": self.guide.name, "settings": self.guide.identity()}} if self.guide else {})
+
+    def _sections(self) -> dict:
+        """All arrays of a checkpoint."""
+        return film_sections(self.film) | ({"guide": self.guide.arrays()} if self.guide else {})
 
     def save_checkpoint(self, path: str | os.PathLike) -> None:
         """Writes all that `load_checkpoint` needs, see `wavefront.checkpoint`; `path` is replaced whole or not at all.
@@ -296,7 +323,7 @@ class Renderer:
             "identity": self._identity(),
             "statistics": dataclasses.asdict(self.statistics),
         }
-        write_checkpoint(path, about, film_sections(self.film))
+        write_checkpoint(path, about, self._sections())
 
     def load_checkpoint(self, path: str | os.PathLike) -> None:
         """Goes on from a checkpoint of the same scene, settings, seed, version and kind of device.
@@ -318,19 +345,25 @@ class Renderer:
                     "allowed: none in a strict render"
                 )
 
-        about = read_checkpoint(path, self._identity(), film_sections(self.film), check)
+        about = read_checkpoint(path, self._identity(), self._sections(), check)
         self._resumed = Statistics(**about["statistics"])
         self.film.sample_count = self._resumed.sample_count
         self.statistics.render_seconds = self._resumed.render_seconds
+        if self.guide:
+            self.guide.restored()
         self._collect()
 
-    def _pass(self, samples: int) -> None:
+    def _pass(self, samples: int, training: bool = False) -> None:
         film = self.film
+        if training:
+            self._guiding.begin(self.workers, film.sample_count)
         run_tiles(self.workers, plan_tiles(film.width, film.height, self.capacity, film.sample_count, samples))
         if self.device != "cpu":
             wp.synchronize_device(self.device)
         for worker in self.workers:
             worker.check_status()
+        if training:
+            self._guiding.train(self.workers)
         first, left_out = film.sample_count, sum(self.statistics.nonfinite.values())
         film.sample_count += samples
         self._collect()
@@ -345,8 +378,10 @@ class Renderer:
             sample: From 0.
 
         Raises:
-            WavefrontError: No such pixel or sample.
+            WavefrontError: No such pixel or sample, or the render is guided.
         """
+        if self.guide:
+            raise WavefrontError(f"a path of a render that a guide ({self.guide.name}) leads cannot be traced again")
         if self._trace_worker is None:
             self._trace_worker = TraceWorker(self)
         return self._trace_worker.trace(x, y, sample)
@@ -360,8 +395,10 @@ class Renderer:
         s.rays = before.rays + int(totals[TOTAL_RAYS])
         s.shadow_rays = before.shadow_rays + int(totals[TOTAL_SHADOW_RAYS])
         s.stage_seconds, s.nonfinite = dict(before.stage_seconds), dict(before.nonfinite)
-        for worker in self.workers:
-            for stage, value in worker.stage_seconds.items():
+        between = [self._guiding.seconds] if self._guiding else []
+        for seconds in [worker.stage_seconds for worker in self.workers] + between:
+            for stage, value in seconds.items():
                 s.stage_seconds[stage] = s.stage_seconds.get(stage, 0.0) + value
+        for worker in self.workers:
             for stage, value in worker.nonfinite().items():
                 s.nonfinite[stage] = s.nonfinite.get(stage, 0) + value

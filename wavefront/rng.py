@@ -12,6 +12,7 @@ import warp as wp
 PURPOSE_CAMERA = wp.constant(0)  # position on the film and on the lens
 PURPOSE_LIGHT = wp.constant(1)  # choice of a light and of a point on it
 PURPOSE_BSDF = wp.constant(2)  # lobe, direction, and Russian roulette
+PURPOSE_TECHNIQUE = wp.constant(3)  # whether the BSDF or the guide is sampled
 PURPOSE_GUIDE = wp.constant(16)  # 16 to 31 belong to guiding methods
 
 # Multipliers and Weyl increments of Salmon et al. 2011, section 3.3 (Weyl: golden ratio and sqrt(3) - 1).

@@ -18,12 +18,12 @@ def is_blend(kind: int) -> bool:
 
 
 @functools.cache
-def make_blend(kinds: tuple[str, ...], textures: tuple[str, ...]):
-    """The functions of `make_kinds`, for blends too; the very same where a scene has none."""
-    functions = make_kinds(kinds, textures)
-    if not set(kinds).intersection(BLENDS):
-        return functions
-    eval_local, sample_local, albedo_local = functions
+def make_part_weight(textures: tuple[str, ...]):
+    """`weight_of(tables, textures, part, uv) -> float`: the weight of a part of a blend.
+
+    Args:
+        textures: Kinds of texture that parameters may have.
+    """
     eval_scalar = make_eval_scalar(textures)
 
     @wp.func
@@ -34,6 +34,18 @@ def make_blend(kinds: tuple[str, ...], textures: tuple[str, ...]):
             w = wp.clamp(eval_scalar(textures, factor.weight, factor.weight_texture, uv), 0.0, 1.0)
             weight *= wp.where(factor.complement == 1, 1.0 - w, w)
         return weight
+
+    return weight_of
+
+
+@functools.cache
+def make_blend(kinds: tuple[str, ...], textures: tuple[str, ...]):
+    """The functions of `make_kinds`, for blends too; the very same where a scene has none."""
+    functions = make_kinds(kinds, textures)
+    if not set(kinds).intersection(BLENDS):
+        return functions
+    eval_local, sample_local, albedo_local = functions
+    weight_of = make_part_weight(textures)
 
     # Each function has one place where it calls that of `make_kinds`, which is large: a BSDF that is no blend goes the
     # way of a part. Else CUDA's compiler has all of it twice.

@@ -54,6 +54,25 @@ def is_smooth(material: Material, cos_o: float) -> bool:
 
 
 @functools.cache
+def make_opacity(textures: tuple[str, ...]):
+    """`opacity_at(textures, material, uv) -> float`: the share of a surface that is there.
+
+    Args:
+        textures: Kinds of texture that parameters may have.
+    """
+    eval_scalar = make_eval_scalar(textures)
+
+    @wp.func
+    def opacity_at(textures: TextureTables, material: Material, uv: wp.vec2) -> float:
+        opacity = eval_scalar(textures, material.opacity, material.opacity_texture, uv)
+        if material.cutoff > 0.0:
+            return wp.where(opacity >= material.cutoff, 1.0, 0.0)
+        return wp.clamp(opacity, 0.0, 1.0)
+
+    return opacity_at
+
+
+@functools.cache
 def make_bsdf(kinds: tuple[str, ...], mask: bool, textures: tuple[str, ...], tangents: bool, maps: bool):
     """BSDF functions for the kinds in a scene.
 
@@ -70,15 +89,8 @@ def make_bsdf(kinds: tuple[str, ...], mask: bool, textures: tuple[str, ...], tan
         space, and `eval_albedo(tables, textures, material, uv, normal, wo) -> vec3`, a colour for denoisers.
     """
     eval_local, sample_local, albedo_local = make_blend(kinds, textures)
-    eval_scalar = make_eval_scalar(textures)
+    opacity_at = make_opacity(textures)
     _, basis = make_frame(tangents, maps)
-
-    @wp.func
-    def opacity_at(textures: TextureTables, material: Material, uv: wp.vec2) -> float:
-        opacity = eval_scalar(textures, material.opacity, material.opacity_texture, uv)
-        if material.cutoff > 0.0:
-            return wp.where(opacity >= material.cutoff, 1.0, 0.0)
-        return wp.clamp(opacity, 0.0, 1.0)
 
     @wp.func
     def mirror_side(kind: int, v: wp.vec3, cos_o: float) -> wp.vec3:

@@ -9,9 +9,13 @@ from wavefront.queues import (
     DEPTH,
     EMISSIVE,
     ESCAPED,
+    GUIDED,
     HITS,
+    LIT,
+    PROPOSED,
     RAYS,
     SHADOW,
+    SMOOTH,
     TOTAL_RAYS,
     TOTAL_SHADOW_RAYS,
 )
@@ -32,5 +36,20 @@ def advance_bounce(counters: wp.array[wp.int32]):
     counters[ESCAPED] = 0
     counters[EMISSIVE] = 0
     counters[SHADOW] = 0
+    counters[DEPTH] += 1
+    counters[CONTINUE] = wp.where(counters[RAYS] > 0, 1, 0)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def advance_guided_bounce(counters: wp.array[wp.int32]):
+    """As `advance_bounce`, with the queues of a guided bounce."""
+    counters[HITS] = 0
+    counters[ESCAPED] = 0
+    counters[EMISSIVE] = 0
+    counters[SHADOW] = 0
+    counters[GUIDED] = 0
+    counters[LIT] = 0
+    counters[PROPOSED] = 0
+    counters[SMOOTH] = 0
     counters[DEPTH] += 1
     counters[CONTINUE] = wp.where(counters[RAYS] > 0, 1, 0)

@@ -1,0 +1,63 @@
+"""Direct light of a guided bounce, second part: weights light samples against the mixture, and queues shadow rays."""
+
+from __future__ import annotations
+
+import functools
+
+import warp as wp
+
+from wavefront.light.mis import power_heuristic
+from wavefront.proposals import LightProposals, Proposals, make_bsdf_share, make_scatter_pdf
+from wavefront.queues import NONFINITE_DIRECT, Paths, Queue, ShadowRays, push, queue_size
+from wavefront.recording import RecordScratch
+
+
+@functools.cache
+def make_guided_light(mixed_deltas: bool, guide_pdf: bool, recorded: bool):
+    """Kernel of the stage.
+
+    Args:
+        mixed_deltas, guide_pdf: Of `Features`.
+        recorded: Whether there are records, which need the light without the throughput.
+    """
+    bsdf_share, scatter_pdf = make_bsdf_share(mixed_deltas), make_scatter_pdf(guide_pdf)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def weight_light_samples(
+        paths: Paths,
+        proposals: Proposals,
+        light_proposals: LightProposals,
+        lit: Queue,
+        # in and out
+        shadow_rays: ShadowRays,
+        # out
+        scratch: RecordScratch,
+        shadow: Queue,
+        counters: wp.array[wp.int32],
+    ):
+        i = wp.tid()
+        if i >= queue_size(lit):
+            return
+        slot = lit.slots[i]
+        pdf = light_proposals.pdf[slot]
+        weight = 1.0 / pdf
+        if light_proposals.delta[slot] == 0:
+            guide_pdf_at = float(0.0)
+            if wp.static(guide_pdf):
+                guide_pdf_at = light_proposals.guide_pdf[slot]
+            other = scatter_pdf(bsdf_share(proposals, slot), light_proposals.bsdf_pdf[slot], guide_pdf_at)
+            if not (wp.isfinite(other) and other >= 0.0):
+                wp.atomic_add(counters, NONFINITE_DIRECT, 1)
+                return
+            weight *= power_heuristic(pdf, other)
+        arriving = shadow_rays.L[slot]
+        L = weight * wp.cw_mul(paths.beta[slot], arriving)
+        if not (wp.isfinite(L) and wp.min(L) >= 0.0):
+            wp.atomic_add(counters, NONFINITE_DIRECT, 1)
+            return
+        if wp.static(recorded):
+            scratch.light[slot] = weight * arriving
+        shadow_rays.L[slot] = L
+        push(shadow, slot, counters)
+
+    return weight_light_samples

@@ -1,0 +1,104 @@
+"""Writes down what recorded paths find on their way: see `wavefront.recording`.
+
+The stages that add emission multiply it with the throughput. While paths are recorded, that is put aside before the
+intersection, which then leaves the transmittance of the segment in its place; the same kernels run on that first, into
+an array of their own, and once more with the throughput.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import warp as wp
+
+from wavefront.queues import DEPTH, Paths, Queue, queue_size
+from wavefront.recording import RecordScratch, Rows, record_row
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def put_throughput_aside(
+    rays: Queue,
+    # out
+    paths: Paths,
+    scratch: RecordScratch,
+):
+    """Before the intersection."""
+    i = wp.tid()
+    if i >= queue_size(rays):
+        return
+    slot = rays.slots[i]
+    scratch.beta[slot] = paths.beta[slot]
+    paths.beta[slot] = wp.vec3(1.0)
+
+
+@functools.cache
+def make_record_arrivals(taken: bool):
+    """Kernel of the stage after the intersection and the emission that is seen from the last vertex.
+
+    Args:
+        taken: Whether weights take from the emission, and the records shall have what they take.
+    """
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def record_arrivals(
+        rays: Queue,
+        tile: wp.array[wp.int32],
+        counters: wp.array[wp.int32],
+        # out
+        paths: Paths,
+        scratch: RecordScratch,
+        rows: Rows,
+    ):
+        i = wp.tid()
+        if i >= queue_size(rays):
+            return
+        slot = rays.slots[i]
+        through = paths.beta[slot]
+        paths.beta[slot] = wp.cw_mul(scratch.beta[slot], through)
+        emission = scratch.emission[slot]
+        scratch.emission[slot] = wp.vec3(0.0)
+        whole = wp.vec3(0.0)
+        if wp.static(taken):
+            whole = scratch.whole_emission[slot]
+            scratch.whole_emission[slot] = wp.vec3(0.0)
+        row = record_row(rows, tile, slot)
+        if row < 0:
+            return
+        depth = counters[DEPTH]
+        entry = wp.min(depth, rows.depth) * rows.count + row
+        if depth <= rows.depth:
+            rows.arrival[entry] = emission
+            rows.through[entry] = through
+            if wp.static(taken):
+                rows.taken[entry] = wp.max(whole - emission, wp.vec3(0.0))
+        else:
+            rows.arrival[entry] += wp.cw_mul(rows.through[entry], emission)
+            rows.through[entry] = wp.cw_mul(rows.through[entry], through)
+
+    return record_arrivals
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def record_direct_light(
+    shadow: Queue,
+    tile: wp.array[wp.int32],
+    counters: wp.array[wp.int32],
+    # out
+    paths: Paths,
+    scratch: RecordScratch,
+    rows: Rows,
+):
+    """After the shadow rays, which have left in `scratch.visible` what they would have added to the path."""
+    i = wp.tid()
+    if i >= queue_size(shadow):
+        return
+    slot = shadow.slots[i]
+    L = scratch.visible[slot]
+    if wp.max(L) == 0.0:
+        return
+    scratch.visible[slot] = wp.vec3(0.0)
+    paths.L[slot] += L
+    row = record_row(rows, tile, slot)
+    if row >= 0:
+        entry = wp.min(counters[DEPTH], rows.depth) * rows.count + row
+        rows.arrival[entry] += wp.cw_mul(rows.through[entry], scratch.light[slot])
