@@ -2,16 +2,17 @@
 
     python -m tools.peers.cycles --install
 
-makes an environment of its own for Blender's module `bpy`, which wants one version of Python and pins packages that this
-project does not need. Nothing is ever installed beside the project.
+makes an environment of its own for Blender's module `bpy`, which wants one version of Python and packages that this
+project does not need. Nothing is installed beside the project.
 
-A render is a process of that environment (`cycles_child`) that holds one scene (`cycles_scene`) and renders samples when
-asked to. The same in both renderers: radiance in linear Rec. 709 without any view transform, path length, next-event
-estimation, triangles with smooth normals, emission by side, conductors and dielectrics by their Fresnel equations with
-single-scattering microfacets. No clamping, no filtered caustics, no denoising, no adaptive sampling, a box filter.
-Cycles' own: the random numbers (a Sobol sequence), the selection of lights (a tree), the way in which Russian roulette
-depends on the throughput, spheres (triangles). Smooth objects inside of which there is a camera or a light look different,
-because Cycles leaves out the scaling of radiance by the squared index of refraction. All else is refused.
+A render is a process of that environment (`cycles_child`) that holds one scene (`cycles_scene`) and renders samples
+when asked to. The same in both renderers: radiance in linear Rec. 709 without any view transform, the length of paths,
+next-event estimation, triangles with smooth normals, emission by side, conductors and dielectrics by their Fresnel
+equations with single-scattering microfacets, lights without extent. There is no clamping, no filtering of caustics, no
+denoising, no adaptive sampling, and the filter is a box. Cycles' own are its random numbers (a Sobol sequence, without
+the first sample, which it puts in the middle of the pixel), its selection of lights (a tree), and how Russian roulette
+depends on the throughput. Spheres are triangles with exact normals. Where a camera or a light is inside of glass,
+images differ: Cycles leaves out that radiance scales with the squared index of refraction. All else is refused.
 """
 
 from __future__ import annotations

@@ -92,7 +92,7 @@ def color_and_strength(value) -> tuple[list[float], float]:
 
 
 class Images:
-    """The images that nodes name. Each is made when the folder is written, and so never where a scene is only checked."""
+    """The images that nodes name. Each is made when it is written, and so never where a scene is only checked."""
 
     def __init__(self):
         self.makers: dict[str, object] = {}

@@ -40,6 +40,7 @@ LEAST_DEPTH, LARGEST_DEPTH = 2, MAX_BOUNCES + 2
 FIRST_SAMPLE = 1 << 13
 SEQUENCE = 1 << 24  # samples per pixel
 MAX_SAMPLES = SEQUENCE - FIRST_SAMPLE
+LEAST_SIZE = 4  # pixels
 SENSOR_WIDTH = 36.0  # mm
 SPHERE_ROWS, SPHERE_COLUMNS = 96, 192  # of the triangles that a sphere is made of
 WORLD_MAP = (256, 4096)  # width of the map that the environment is sampled with, at least and at most
@@ -245,6 +246,9 @@ class _Writer:
                 raise WavefrontError(f"integrator.{name} is {json.dumps(value)}; with cycles: {json.dumps(only)}")
         if not isinstance(film.filter, description.BoxFilter):
             raise WavefrontError(f"film.filter.type is {type(film.filter).__struct_config__.tag}; with cycles: box")
+        for name in ("width", "height"):
+            if getattr(film, name) < LEAST_SIZE:
+                raise WavefrontError(f"film.{name} is {getattr(film, name)}; with cycles: {LEAST_SIZE} or more")
         if film.crop is not None:
             raise WavefrontError("film.crop: with cycles: none")
 
