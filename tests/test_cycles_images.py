@@ -13,11 +13,12 @@ import pytest
 from PIL import Image
 
 from tools import methods
-from tools.image_test import compare
+from tools.image_test import RATIO_TOLERANCE, compare
 from tools.methods import load_job
 from tools.peers import cycles
 from tools.peers.images import cycles_batches, like_the_peer, our_batches
 from wavefront.errors import WavefrontError
+from wavefront.renderer import Renderer
 from wavefront.scene import description as d
 from wavefront.scene import load_scene
 from wavefront.scene.images import write_exr
@@ -30,7 +31,7 @@ pytestmark = [
 ]
 
 
-def check(name: str, scene: d.Scene, spp: int = 32, guided: bool = False, **settings) -> None:
+def check(name: str, scene: d.Scene, spp: int = 32, guided: bool = False, tolerance=RATIO_TOLERANCE, **settings):
     """Renders a scene with both renderers until they are known to be the same, or not."""
     session = cycles.Session(scene, guided, threads=2)
     try:
@@ -39,7 +40,7 @@ def check(name: str, scene: d.Scene, spp: int = 32, guided: bool = False, **sett
     finally:
         session.close()
     print(f"{name}: {comparison}")  # shown with -s, or when the test fails
-    comparison.check()
+    comparison.check(tolerance)
 
 
 # --- closed forms ------------------------------------------------------------------------------------------------
@@ -107,13 +108,47 @@ def test_irradiance(emitter, expected):
     np.testing.assert_allclose(mean(scene, 1024), 0.5 / np.pi * np.array(expected), rtol=2e-3)
 
 
+def microfacet_albedo(alpha: float, cosine: float, correlated: bool) -> float:
+    """Of a GGX surface that reflects all light, by quadrature over microfacet normals: masking and shadowing that are
+    correlated by height (Heitz 2014, equation 99) or separable (equation 98)."""
+    n = 1000
+    theta, phi = np.meshgrid((np.arange(n) + 0.5) / n * np.pi / 2, (np.arange(n) + 0.5) / n * 2 * np.pi, indexing="ij")
+    m = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
+    wo = np.array([np.sqrt(1.0 - cosine**2), 0.0, cosine])
+    wi_z = 2.0 * (m @ wo) * m[..., 2] - cosine
+    density = alpha**2 / (np.pi * (m[..., 2] ** 2 * (alpha**2 - 1.0) + 1.0) ** 2)
+    o, i = (0.5 * np.sqrt(1.0 + alpha**2 * (1.0 / np.maximum(c, 1e-9) ** 2 - 1.0)) - 0.5 for c in (cosine, wi_z))
+    g = 1.0 / (1.0 + o + i) if correlated else 1.0 / ((1.0 + o) * (1.0 + i))
+    seen = (m @ wo > 0.0) & (wi_z > 0.0)
+    return float((seen * density * g * (m @ wo) / cosine * np.sin(theta)).sum() * np.pi**2 / n**2)
+
+
+@pytest.mark.parametrize(("alpha", "degrees"), [(0.15, 60.0), (0.5, 60.0), (0.5, 80.0)])
+def test_masking_of_microfacets(alpha, degrees):
+    """What is not the same: Cycles' rough surfaces are the brighter ones, by 0.04, 1.8 and 7.8 % here."""
+    angle = np.radians(degrees)
+    origin = (4.0 * float(np.sin(angle)), 0.0, 4.0 * float(np.cos(angle)))
+    scene = d.Scene(
+        shapes=[d.Rectangle(bsdf=d.RoughConductor(material="none", alpha=alpha))],
+        emitters=[d.Constant(radiance=1.0)],
+        camera=d.Orthographic(
+            width=0.1, to_world=[d.TransformStep(look_at=d.LookAt(origin=origin, target=(0.0, 0.0, 0.0)))]
+        ),
+        film=d.Film(width=16, height=16),
+        integrator=d.PathIntegrator(max_depth=2, rr_depth=None),
+    )
+    cosine = float(np.cos(angle))
+    np.testing.assert_allclose(mean(scene, 1024), microfacet_albedo(alpha, cosine, True), rtol=2e-3)
+    ours = Renderer(scene, seed=1).render(spp=1024).mean(axis=(0, 1))
+    np.testing.assert_allclose(ours, microfacet_albedo(alpha, cosine, False), rtol=4e-3)
+
+
 # --- the scenes of this repository -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("name", "error"),
     [
-        ("cornell-box", 0.0015),
         ("furnace", 0.001),
         ("light-envmap", 0.001),
         ("light-spot", 0.001),
@@ -121,7 +156,6 @@ def test_irradiance(emitter, expected):
         ("camera-orthographic", 0.001),
         ("material-rough-conductor-anisotropic", 0.0015),
         ("material-rough-conductor-beckmann", 0.0015),
-        ("material-rough-dielectric", 0.0015),
         ("material-dielectric", 0.0015),
         ("material-diffuse-bitmap", 0.0015),
         ("material-twosided", 0.0015),
@@ -132,11 +166,17 @@ def test_scenes(name, error):
     check(name, like_the_peer(scene, 32, 32, min(scene.integrator.max_depth, 6)), error=error)
 
 
-@pytest.mark.parametrize("name", ["cornell-box", "material-rough-conductor-ggx"])
-def test_guided(name):
-    """Guiding changes no mean; every batch learns anew."""
-    scene = load_scene(SCENES / f"{name}.json")
-    check(f"guided {name}", like_the_peer(scene, 32, 32, 5), spp=64, guided=True, error=0.002)
+@pytest.mark.parametrize("guided", [False, True])
+def test_cornell_box(guided):
+    """Guiding changes no mean; every batch learns anew. The edge of the lamp is most of our noise."""
+    scene = like_the_peer(load_scene(SCENES / "cornell-box.json"), 32, 32, 6)
+    check(f"cornell-box {guided}", scene, spp=192, guided=guided, tolerance=0.01, error=0.002, most=64)
+
+
+def test_rough_glass():
+    """Masking of microfacets differs, see below: at this roughness by less than a percent."""
+    scene = like_the_peer(load_scene(SCENES / "material-rough-dielectric.json"), 32, 32, 6)
+    check("rough glass", scene, tolerance=0.01, rounding=0.01, error=0.002)
 
 
 def test_without_next_event_estimation():

@@ -11,8 +11,12 @@ next-event estimation, triangles with smooth normals, emission by side, conducto
 equations with single-scattering microfacets, lights without extent. There is no clamping, no filtering of caustics, no
 denoising, no adaptive sampling, and the filter is a box. Cycles' own are its random numbers (a Sobol sequence, without
 the first sample, which it puts in the middle of the pixel), its selection of lights (a tree), and how Russian roulette
-depends on the throughput. Spheres are triangles with exact normals. Where a camera or a light is inside of glass,
-images differ: Cycles leaves out that radiance scales with the squared index of refraction. All else is refused.
+depends on the throughput. Spheres are triangles with exact normals. All else is refused.
+
+What differs: microfacets mask and shadow each other correlated by height in Cycles, separably in ours, so that rough
+surfaces are brighter in Cycles: GGX that reflects all light, seen at 60 degrees, by 0.04 % at an alpha of 0.15 and by
+1.8 % at 0.5; at 80 degrees by 1 and 8 %. And where a camera or a light is inside of glass, Cycles leaves out that
+radiance scales with the squared index of refraction.
 """
 
 from __future__ import annotations
