@@ -134,7 +134,7 @@ class Fake:
     image_seconds = 3.0
 
     def __init__(self, job, seed):
-        self.compile_seconds, self.training_seconds, self.samples = 2.0, 0.0, 0
+        self.whole, self.compile_seconds, self.training_seconds, self.samples = False, 2.0, 0.0, 0
         self.clock.time += 5.0
 
     def add(self, spp, seconds=None):

@@ -62,6 +62,8 @@ from wavefront.errors import WavefrontError
 from wavefront.identity import explain_differences, scene_hash, scene_records
 from wavefront.scene.images import replacing, write_exr
 
+MOST_SAMPLES = 1 << 24  # that an engine is asked for at once
+
 
 class Stopwatch:
     """Divides the time since it was made among named parts; what belongs to none is ``other``.
@@ -119,7 +121,8 @@ def render_budget(
         measure: From an image to its errors by metric.
 
     Returns:
-        Errors at powers of two of the samples and at the end; the last is that of the image.
+        Errors at powers of two of the samples and at the end; the last is that of the image. Of an engine that is
+        asked for the `whole` there is the end alone.
     """
     points: list[Point] = []
     next_point = 1
@@ -136,7 +139,9 @@ def render_budget(
                 next_point *= 2
             if over:
                 return points
-        target = next_point if budget.spp is None else min(next_point, budget.spp)
+        target = MOST_SAMPLES if engine.whole else next_point
+        if budget.spp is not None:
+            target = min(target, budget.spp)
         with watch.part("render"):
             engine.add(target - engine.samples, left)
 

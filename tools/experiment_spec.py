@@ -15,7 +15,7 @@ from msgspec import Meta
 
 from tools.methods import RENDERERS, SEEDS, Job, load_job, scene_name
 from tools.metrics import METRICS
-from tools.reference_render import Goal
+from tools.reference_render import MAKERS, Goal
 from tools.reference_store import target_records
 from tools.results import Budget, Struct, slug
 from wavefront.errors import SceneError, WavefrontError
@@ -148,7 +148,7 @@ def check_spec(spec: Spec, path: Path) -> None:
         if reference.error is None and reference.spp is None and reference.seconds is None:
             refuse(where, "no limit; allowed: at least one of error, spp, seconds")
         for j, renderer in enumerate(reference.renderers):
-            one_of(f"{where}.renderers[{j}]", renderer, tuple(RENDERERS))
+            one_of(f"{where}.renderers[{j}]", renderer, tuple(MAKERS))
         distinct(f"{where}.renderers", reference.renderers)
     if spec.baseline is not None:
         one_of("baseline", spec.baseline, [method.name for method in spec.methods])

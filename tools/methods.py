@@ -18,7 +18,9 @@ import numpy as np
 import warp as wp
 
 import wavefront
+from tools.peers import cycles
 from tools.peers import mitsuba as peer
+from tools.peers.cycles_scene import check_scene
 from tools.peers.mitsuba_records import integrator_of
 from wavefront.errors import WavefrontError
 from wavefront.identity import scene_hash
@@ -28,6 +30,8 @@ from wavefront.scene import description, load_scene
 SEEDS = 1 << 7  # of references, and as many of the runs of an experiment
 CALLS = 1 << 12  # of Mitsuba with one such seed; each has a seed of its own
 PEER_CALL_SECONDS = 1.0  # of one call of Mitsuba, at most about
+CYCLES_PROBES = 2  # first calls of Cycles, whose samples are few where there is a budget of time
+CYCLES_PROBE = 2  # samples of the first, and of the next one over those that are there
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,11 +59,13 @@ class Engine(Protocol):
     """One render in progress. Making one loads and compiles all that rendering needs.
 
     Attributes:
+        whole: It learns anew in each call of `add`, and so has to be asked for all samples at once.
         compile_seconds: Of the making, what compiling took.
         training_seconds: Of all calls of `add`, what training took; rendering waits for it.
         samples: Per pixel, so far.
     """
 
+    whole: bool
     compile_seconds: float
     training_seconds: float
     samples: int
@@ -89,7 +95,8 @@ class Engine(Protocol):
     def add(self, spp: int, seconds: float | None = None) -> None:
         """Adds samples per pixel: `spp` of them, or fewer, but one or more, if `seconds` are over before.
 
-        `spp` and what is there already make a power of two, or the end of the run.
+        `spp` and what is there already make a power of two, or the end of the run. An engine that is asked for the
+        `whole` gets all samples of the run, or more than it has time for.
         """
 
     def image(self) -> np.ndarray:
@@ -129,6 +136,7 @@ def scene_name(path: str | Path) -> str:
 class Wavefront:
     """This renderer."""
 
+    whole = False
     training_seconds = 0.0  # path tracing has nothing to learn
 
     def __init__(self, job: Job, seed: int):
@@ -145,9 +153,8 @@ class Wavefront:
 
     @staticmethod
     def run_seed(names: Sequence[str], seed: int) -> int:
-        digest = hashlib.sha256(json.dumps([*names, seed]).encode()).digest()
         # Beyond the seeds that a person gives, and still a number that every JSON reader takes whole.
-        return int.from_bytes(digest[:6], "little") | 1 << 52
+        return _digest(names, seed) | 1 << 52
 
     @property
     def samples(self) -> int:
@@ -181,6 +188,7 @@ class Mitsuba:
     else it gets our records.
     """
 
+    whole = False
     training_seconds = 0.0
 
     def __init__(self, job: Job, seed: int):
@@ -285,4 +293,78 @@ def _power_of_two(n: int) -> int:
     return 1 << (n.bit_length() - 1)
 
 
-RENDERERS: dict[str, type[Engine]] = {"wavefront": Wavefront, "mitsuba": Mitsuba}
+def _digest(names: Sequence[str], seed: int) -> int:
+    """A number of 48 bits from names and a seed."""
+    return int.from_bytes(hashlib.sha256(json.dumps([*names, seed]).encode()).digest()[:6], "little")
+
+
+# --- Cycles ------------------------------------------------------------------------------------------------------
+
+
+class Cycles:
+    """Blender's path tracer Cycles, in a process of its own (see `tools.peers.cycles`).
+
+    It compiles nothing. Starting Blender and building the scene belong to loading.
+    """
+
+    whole, guided = False, False
+    compile_seconds = 0.0
+    training_seconds = 0.0  # of guiding: in the time of rendering; Cycles does not say how much
+
+    def __init__(self, job: Job, seed: int):
+        self.session = cycles.Session(job.scene, self.guided, job.threads)
+        self.session.warm_up()
+        self.seed, self.calls, self.samples, self.total, self.rate = seed, 0, 0, 0.0, None
+
+    @staticmethod
+    def versions(device: str) -> dict[str, str]:
+        cycles.require()
+        return {"blender": cycles.VERSION}
+
+    @staticmethod
+    def check(job: Job) -> None:
+        if job.device != "cpu":
+            raise WavefrontError(f"--device {job.device}: cycles is run on the cpu alone")
+        check_scene(job.scene)
+
+    @staticmethod
+    def run_seed(names: Sequence[str], seed: int) -> int:
+        return _digest(names, seed) % (1 << 31)
+
+    def add(self, spp: int, seconds: float | None = None) -> None:
+        end = None if seconds is None else time.perf_counter() + seconds
+        target = self.samples + spp
+        while self.samples < target:
+            begin = time.perf_counter()
+            count = target - self.samples
+            if end is not None:
+                # What a sample takes is found with few of them.
+                most = CYCLES_PROBE * (1 + self.samples) if self.calls < CYCLES_PROBES else (end - begin) * self.rate
+                count = max(1, min(count, int(most)))
+            image = self.session.render(count, self.seed, self.samples)
+            self.total = self.total + count * image.astype(np.float64)
+            self.samples, self.calls = self.samples + count, self.calls + 1
+            now = time.perf_counter()
+            self.rate = count / (now - begin)
+            if end is not None and now >= end:
+                break
+
+    def image(self) -> np.ndarray:
+        return self.total / self.samples
+
+    def account(self) -> dict:
+        return {"calls": self.calls}
+
+
+class CyclesGuided(Cycles):
+    """Cycles with path guiding: Open PGL's mixtures, learned while rendering."""
+
+    whole, guided = True, True
+
+
+RENDERERS: dict[str, type[Engine]] = {
+    "wavefront": Wavefront,
+    "mitsuba": Mitsuba,
+    "cycles": Cycles,
+    "cycles guided": CyclesGuided,
+}

@@ -85,7 +85,7 @@ def make_camera(camera: description.Camera, film: description.Film) -> Camera:
         record.du = wp.vec3(*(right * (2.0 * half_width / width)))
         record.dv = wp.vec3(*(up * (-2.0 * half_height / height)))
         return record
-    half_width, half_height = _half_extent(camera, film)
+    half_width, half_height = half_extent(camera, film)
     x, y = camera.principal_point_offset
     corner = (2.0 * x - 1.0) * half_width * right + (1.0 - 2.0 * y) * half_height * up - back
     # Only the direction matters; scaled so that tiny and huge transforms keep float32's digits.
@@ -102,7 +102,7 @@ def make_camera(camera: description.Camera, film: description.Film) -> Camera:
     return record
 
 
-def _half_extent(camera: description.Perspective, film: description.Film) -> tuple[float, float]:
+def half_extent(camera: description.Perspective, film: description.Film) -> tuple[float, float]:
     """Half the width and height of the film at a distance of one."""
     width, height = film.width * film.pixel_aspect, film.height
     axis = camera.fov_axis

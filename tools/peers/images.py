@@ -1,4 +1,4 @@
-"""Batches of samples of one scene from two renderers, ours and Mitsuba, for `tools.image_test`."""
+"""Batches of samples of one scene from ours and from the peers, for `tools.image_test`."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from tools.image_test import ROUNDING
+from tools.peers import cycles
 from tools.peers import mitsuba as peer
 from wavefront.errors import WavefrontError
 from wavefront.renderer import Renderer
@@ -61,4 +62,11 @@ def their_batches(scene, max_depth: int, spp: int, seed: int = 0, integrator: st
     """Means of Mitsuba's renders with seeds from `seed` on; arguments as in `tools.peers.mitsuba.render`."""
     while True:
         yield peer.render(scene, spp, seed, max_depth, integrator=integrator)
+        seed += 1
+
+
+def cycles_batches(session: cycles.Session, spp: int, seed: int = 0) -> Iterator[np.ndarray]:
+    """Means of renders of Cycles with seeds from `seed` on."""
+    while True:
+        yield session.render(spp, seed)
         seed += 1

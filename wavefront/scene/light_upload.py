@@ -119,7 +119,7 @@ class LightUpload:
         self.tables.environment = self._add("constant", power, len(self.emitters) - 1)
 
     def _envmap(self, emitter: description.Envmap, where: str, cross_section: float) -> None:
-        pixels = _load_envmap(emitter.file, where, self.notes)
+        pixels = load_envmap(emitter.file, where, self.notes)
         matrix = to_matrix(emitter.to_world, f"{where}.to_world")[:3, :3]
         self._map(pixels, emitter.scale, matrix, cross_section)
 
@@ -197,7 +197,7 @@ def _unit(vector) -> np.ndarray:
     return np.asarray(vector, np.float64) / np.linalg.norm(vector)
 
 
-def _load_envmap(file: str, where: str, notes: list[str]) -> np.ndarray:
+def load_envmap(file: str, where: str, notes: list[str]) -> np.ndarray:
     """Pixels of an environment map, [height, width, 1 or 3], uint8, float16 or float32, finite and not negative."""
     where = f"{where}.file"
     pixels = load_image(file, where)

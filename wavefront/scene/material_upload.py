@@ -38,7 +38,7 @@ def bsdf_kind(bsdf: description.Bsdf) -> str:
     return BSDF_KINDS[type(bsdf)]
 
 
-def _principled_eta(bsdf: description.Principled) -> float:
+def principled_eta(bsdf: description.Principled) -> float:
     """Relative index of refraction; one that would not refract is moved off 1 as in Mitsuba 3 where light passes."""
     transmits = bsdf_kind(bsdf) == "principled_transmissive"
     if bsdf.eta is not None:
@@ -49,7 +49,8 @@ def _principled_eta(bsdf: description.Principled) -> float:
     return 2.0 / (1.0 - np.sqrt(0.08 * specular)) - 1.0
 
 
-def _relative_ior(bsdf) -> float:
+def relative_ior(bsdf) -> float:
+    """Interior over exterior index of refraction of a dielectric or a plastic."""
     interior, exterior = (
         INDEX_OF_REFRACTION[value] if isinstance(value, str) else value for value in (bsdf.int_ior, bsdf.ext_ior)
     )
@@ -234,7 +235,7 @@ class MaterialUpload:
             self._set(record, "reflectance", bsdf.specular_reflectance, f"{where}.specular_reflectance")
         elif kind in ("plastic", "rough_plastic"):
             table = "plastic"
-            record["eta"] = _relative_ior(bsdf)
+            record["eta"] = relative_ior(bsdf)
             record["nonlinear"] = int(bsdf.nonlinear)
             self._set(record, "diffuse", bsdf.diffuse_reflectance, f"{where}.diffuse_reflectance")
             self._set(record, "reflectance", bsdf.specular_reflectance, f"{where}.specular_reflectance")
@@ -249,7 +250,7 @@ class MaterialUpload:
                 self.coatings.append(transmittance)
         elif isinstance(bsdf, description.Principled):
             table = "principled"
-            record["eta"] = _principled_eta(bsdf)
+            record["eta"] = principled_eta(bsdf)
             record["specular_rate"] = bsdf.main_specular_sampling_rate
             record["clearcoat_rate"] = bsdf.clearcoat_sampling_rate
             record["diffuse_rate"] = bsdf.diffuse_reflectance_sampling_rate
@@ -266,7 +267,7 @@ class MaterialUpload:
             record["textured_fraction"], record["fraction_texture"] = zip(*textured, *unused, strict=True)
         else:
             table = "dielectric"
-            record["eta"] = _relative_ior(bsdf)
+            record["eta"] = relative_ior(bsdf)
             self._set(record, "reflectance", bsdf.specular_reflectance, f"{where}.specular_reflectance")
             self._set(record, "transmittance", bsdf.specular_transmittance, f"{where}.specular_transmittance")
         if kind in ("rough_conductor", "rough_dielectric"):
