@@ -79,6 +79,7 @@ def command(spec: Path, folder: Path, *words: str) -> int:
         ({"scenes": [{"file": CORNELL_BOX, "parameters": 3}]}, "scenes[0].parameters: expected an object; found 3"),
         ({"reference": {}}, "reference: no limit; allowed: at least one of error, spp, seconds"),
         ({"reference": {"spp": 9, "renderers": ["pbrt"]}}, "reference.renderers[0]: unknown name 'pbrt'"),
+        ({"reference": {"spp": 9, "renderers": ["cycles"]}}, "unknown name 'cycles'; allowed: wavefront, mitsuba"),
         ({"reference": {"spp": 9, "overrides": ["integrator.max_depth=9"]}}, "change integrator.max_depth"),
     ],
 )

@@ -131,7 +131,7 @@ def install(interpreter: str | None = None, log=print) -> Path:
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
     try:
-        log(f"installing bpy {VERSION} with {python} in {folder}; this downloads about 450 MB")
+        log(f"installing bpy {VERSION} with {python} in {folder}; this downloads about 430 MB")
         _run([python, "-m", "venv", temporary], "the environment cannot be made")
         pip = [_python(temporary), "-m", "pip", "install", "--disable-pip-version-check", "--quiet"]
         _run([*pip, f"bpy=={VERSION}"], f"bpy {VERSION} cannot be installed")

@@ -9,12 +9,13 @@ to the standard error):
     {"width": w, "height": h, "seed": s, "offset": k, "samples": n, "guided": false, "image": path}
 
 renders samples k to k + n - 1 of every pixel, writes their mean to an OpenEXR file, and answers {"seconds": t}. What
-fails answers {"error": text}. The process ends with its standard input. This file imports nothing of the project, which
-need not be installed beside Blender.
+fails answers {"error": text}. The process ends with its standard input, and removes FOLDER. This file imports nothing
+of the project, which need not be installed beside Blender.
 """
 
 import json
 import os
+import shutil
 import sys
 import time
 from pathlib import Path
@@ -212,4 +213,7 @@ def socket_of(sockets, identifier: str):
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    try:
+        main(Path(sys.argv[1]))
+    finally:
+        shutil.rmtree(sys.argv[1], ignore_errors=True)
