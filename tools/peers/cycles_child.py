@@ -9,14 +9,15 @@ to the standard error):
     {"width": w, "height": h, "seed": s, "offset": k, "samples": n, "guided": false, "image": path}
 
 renders samples k to k + n - 1 of every pixel, writes their mean to an OpenEXR file, and answers {"seconds": t}. What
-fails answers {"error": text}. The process ends with its standard input, and removes FOLDER. This file imports nothing
-of the project, which need not be installed beside Blender.
+fails answers {"error": text}. The process ends with its standard input, or with the process that started it, and
+removes FOLDER. This file imports nothing of the project, which need not be installed beside Blender.
 """
 
 import json
 import os
 import shutil
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -45,6 +46,14 @@ def main(folder: Path) -> None:
             answer(seconds=render(**json.loads(line)))
         except Exception as error:
             answer(error=f"{type(error).__name__}: {error}")
+
+
+def end_with(parent: int, folder: str) -> None:
+    """Ends this process, in the middle of a render too, when the one that started it is no more."""
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    shutil.rmtree(folder, ignore_errors=True)
+    os._exit(1)
 
 
 def render(width: int, height: int, seed: int, offset: int, samples: int, guided: bool, image: str) -> float:
@@ -213,6 +222,7 @@ def socket_of(sockets, identifier: str):
 
 
 if __name__ == "__main__":
+    threading.Thread(target=end_with, args=(os.getppid(), sys.argv[1]), daemon=True).start()
     try:
         main(Path(sys.argv[1]))
     finally:
