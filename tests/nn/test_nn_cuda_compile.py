@@ -92,3 +92,4 @@ def test_all_grids_compile_for_cuda(tmp_path, n_dims, arch):
         for interpolation in ("Linear", "Smoothstep", "Nearest"):
             for hashed in (False, True):
                 compile_for_cuda(make_grid_kernels(n_dims, n_features, interpolation, hashed)[0], arch, tmp_path)
+    check(tmp_path, 24)
