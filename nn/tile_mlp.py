@@ -87,8 +87,8 @@ def make_functions(shape: Shape):
         depth: int  # hidden layers
         n_in: int  # blocks of features
         n_out: int  # blocks of outputs
-        n_outputs: int
-        n_blocks: int  # in all
+        n_outputs: int  # their columns
+        n_blocks: int  # of weights, in all
 
     @wp.func
     def operand(x: wp.float32):
