@@ -287,7 +287,7 @@ class Model:
 
         Args:
             x: Inputs ``[n, n_input_dims]``.
-            target: ``[n, n_output_dims]``, or one for each network.
+            target: ``[n, n_output_dims]``, or one for each network. A loss of one's own takes any number of columns.
             loss: A loss of one's own (see `nn.losses`); None: the one of the configuration.
             outputs: Where to write the outputs, if they are wanted.
             report: False: do not read the loss back, which waits for a GPU.
@@ -296,7 +296,8 @@ class Model:
             The loss: the mean over samples and outputs, summed over networks. A loss of one's own is normalised alike.
             None without `report`.
         """
-        if loss is None:
+        own = loss is not None
+        if not own:
             loss = make_loss(self.config.loss.__struct_config__.tag)
         for execution in self._executions:
             execution.load(loss)
@@ -307,7 +308,7 @@ class Model:
         written = (list(outputs) if several else [outputs]) if outputs is not None else [None] * len(self.networks)
         jobs, finishes = {}, []
         for i, (one, out) in enumerate(zip(targets, written, strict=True)):
-            one = as_input(one, self.n_output_dims[i], "target", self.device)
+            one = as_input(one, None if own else self.n_output_dims[i], "target", self.device)
             check_rows(one, rows)
             y = empty((0, 0), self.device)
             if out is not None:
@@ -336,7 +337,7 @@ class Model:
 
         Args:
             x: Inputs.
-            target: Of the loss.
+            target: As in `compute_gradients`.
             dL_dy: Instead of `target`: the gradient of the caller's own loss with respect to the outputs.
             loss: As in `compute_gradients`.
             report: As in `compute_gradients`.
