@@ -15,7 +15,7 @@ from wavefront.bsdf.dispatch import make_bsdf
 from wavefront.bsdf.frame import make_frame
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.guide import Guide, GuideContext, GuideState
-from wavefront.proposals import Proposals
+from wavefront.proposals import INPUTS, Proposals
 from wavefront.queues import DEPTH, Paths, Queue, Surfaces, queue_size
 from wavefront.recording import FIELDS, RecordRequest, Records
 from wavefront.rng import PURPOSE_GUIDE
@@ -425,7 +425,7 @@ class MeanGuide(LobeGuide):
     `passes` keeps the records of all passes, on the host.
     """
 
-    name = "mean"
+    name, inputs = "mean", tuple(INPUTS)
 
     def __init__(self, train_share: float = 0.5, keep: bool = False, depth: int = 16, memory: int = 1 << 26, **lobe):
         super().__init__(**lobe)
