@@ -45,6 +45,7 @@ class Features:
     guide: tuple = ()  # name of the guide, and what tells its kernels from others of that name; empty without a guide
     guide_pdf: bool = True  # the guide has a density
     records: tuple[str, ...] = ()  # fields of the records that the guide trains with; empty if it asks for none
+    weighted: bool = False  # samples have weights of the guide
 
     @property
     def guided(self) -> bool:

@@ -44,6 +44,10 @@ if TYPE_CHECKING:
     from wavefront.scene.description import Scene
     from wavefront.scene.device import DeviceScene
 
+# Least weight of a sample. Next to it the largest, 1, is large enough that the first pass does not count, and small
+# enough that the variance of the two is known to many digits.
+MIN_SAMPLE_WEIGHT = 1e-3
+
 # Purposes of `GuideState.evaluate`.
 LIGHTS = "lights"
 DIRECTIONS = "directions"
@@ -136,6 +140,7 @@ class Guide(ABC):
         bsdf_share: Probability of sampling the BSDF where `GuideState.prepare` does not say otherwise; more than 0, at
             most 1. No guide is trusted with all samples: what it never proposes is found by the BSDF.
         records: What training needs; None for a guide that does not learn.
+        weighted: Whether samples enter the film with the weight of `sample_weight`, else with 1.
     """
 
     name: str
@@ -144,6 +149,7 @@ class Guide(ABC):
     rounds: int = 1
     bsdf_share: float = 0.5
     records: RecordRequest | None = None
+    weighted: bool = False
 
     @abstractmethod
     def bind(self, scene: Scene, device_scene: DeviceScene, features: Features, device: str) -> None:
@@ -187,6 +193,23 @@ class Guide(ABC):
     def train(self, records: Records) -> None:
         """Learns from the records of a pass. Called between passes from one thread; states see the result next."""
         raise NotImplementedError("a guide that trains implements this")
+
+    def sample_weight(self, progress: float) -> float:
+        """Weight in the film of the samples of the next pass, if the guide is `weighted`.
+
+        So that noisy samples of a guide that has learned little do not dominate the error, as in the code of Dong, Wu,
+        Zeng and Zhu (2023), "Neural Parametric Mixtures for Path Guiding". The image is the mean by these weights. It
+        stays unbiased, because a weight is given before its samples are seen: it must depend on the progress alone. A
+        pass whose weight is not 1 has one sample per pixel, so from where the weight is 1 it must stay 1; else the
+        image depends on the length of passes.
+
+        Args:
+            progress: As in `trains`, which is asked first.
+
+        Returns:
+            `MIN_SAMPLE_WEIGHT` to 1; anything else ends the render with an error.
+        """
+        return 1.0
 
     # --- accounts --------------------------------------------------------------------------------------------------
 
