@@ -44,8 +44,8 @@ if TYPE_CHECKING:
     from wavefront.scene.description import Scene
     from wavefront.scene.device import DeviceScene
 
-# Least weight of a sample. Next to it the largest, 1, is large enough that the first pass does not count, and small
-# enough that the variance of the two is known to many digits.
+# Least weight of a sample; the largest is 1. So small that a pass with it hardly counts; more than zero, so that a render
+# of one pass has an image, and enough that float64 sums of squares of both keep the digits of the variance.
 MIN_SAMPLE_WEIGHT = 1e-3
 
 # Purposes of `GuideState.evaluate`.
