@@ -44,8 +44,8 @@ if TYPE_CHECKING:
     from wavefront.scene.description import Scene
     from wavefront.scene.device import DeviceScene
 
-# Least weight of a sample; the largest is 1. So small that a pass with it hardly counts; more than zero, so that a render
-# of one pass has an image, and enough that float64 sums of squares of both keep the digits of the variance.
+# Least weight of a sample; the largest is 1. So small that a pass with it hardly counts; more than zero, so that a
+# render of one pass has an image, and enough that float64 sums of squares of both keep the digits of the variance.
 MIN_SAMPLE_WEIGHT = 1e-3
 
 # Purposes of `GuideState.evaluate`.
@@ -136,20 +136,20 @@ class Guide(ABC):
         name: Of the method, for checkpoints and accounts.
         key: Hashable values that tell this guide's kernels from those of other settings; with the name in `Features`.
         has_pdf: Whether the density of its directions is known. False for resampling.
+        weighted: Whether samples enter the film with the weight of `sample_weight`, else with 1.
         rounds: Calls of `GuideState.propose` per bounce, 1 or more.
         bsdf_share: Probability of sampling the BSDF where `GuideState.prepare` does not say otherwise; more than 0, at
             most 1. No guide is trusted with all samples: what it never proposes is found by the BSDF.
         records: What training needs; None for a guide that does not learn.
-        weighted: Whether samples enter the film with the weight of `sample_weight`, else with 1.
     """
 
     name: str
     key: tuple = ()
     has_pdf: bool = True
+    weighted: bool = False
     rounds: int = 1
     bsdf_share: float = 0.5
     records: RecordRequest | None = None
-    weighted: bool = False
 
     @abstractmethod
     def bind(self, scene: Scene, device_scene: DeviceScene, features: Features, device: str) -> None:
