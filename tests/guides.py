@@ -2,6 +2,7 @@
 
 `HistogramGuide` needs two rounds: the second coordinate of a direction has a distribution that depends on the first.
 `ResamplingGuide` has no density. `LobeGuide` is a closed form. `MeanGuide` learns a number, to see that it is kept.
+`RampGuide` gives little weight to what it does before it has learned.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import warp as wp
 from wavefront.bsdf.dispatch import make_bsdf
 from wavefront.bsdf.frame import make_frame
 from wavefront.bsdf.tables import MaterialTables
-from wavefront.guide import Guide, GuideContext, GuideState
+from wavefront.guide import MIN_SAMPLE_WEIGHT, Guide, GuideContext, GuideState
 from wavefront.proposals import INPUTS, Proposals
 from wavefront.queues import DEPTH, Paths, Queue, Surfaces, queue_size
 from wavefront.recording import FIELDS, RecordRequest, Records
@@ -465,3 +466,19 @@ class MeanGuide(LobeGuide):
 
     def statistics(self):
         return {"records": int(self.sum.numpy()[3])}
+
+
+class RampGuide(MeanGuide):
+    """One that learns, with sample weights that grow with the progress: 1 from `full` on."""
+
+    name, weighted = "ramp", True
+
+    def __init__(self, train_share: float = 0.5, full: float = 0.75, **settings):
+        super().__init__(train_share, **settings)
+        self.full = full
+
+    def sample_weight(self, progress):
+        return min(max(progress / self.full, MIN_SAMPLE_WEIGHT), 1.0)
+
+    def identity(self):
+        return super().identity() | {"full": self.full}

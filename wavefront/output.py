@@ -92,10 +92,10 @@ def image_attributes(renderer: Renderer) -> dict[str, int | str]:
     """What the header of an image says of its making, for those who combine images (see `tools.merge`).
 
     Attributes: ``renderer``, ``sceneHash`` (of `identity.scene_records`), ``settings`` (film and integrator, JSON),
-    ``seed`` (decimal; several after a merge, with commas), ``samplesPerPixel``, and the format's own
-    ``pixelAspectRatio``.
+    ``seed`` (decimal; several after a merge, with commas), ``samplesPerPixel``, ``sumOfWeights`` (of the samples of a
+    pixel, decimal, if samples have weights), and the format's own ``pixelAspectRatio``.
     """
-    records = renderer.scene_records
+    records, film = renderer.scene_records, renderer.film
     return {
         "renderer": f"wavefront {wavefront.__version__}",
         "sceneHash": scene_hash(records),
@@ -103,7 +103,7 @@ def image_attributes(renderer: Renderer) -> dict[str, int | str]:
         "seed": str(renderer.seed),  # text: a header has no 64-bit integers
         "samplesPerPixel": renderer.sample_count,
         "PixelAspectRatio": renderer.scene.film.pixel_aspect,
-    }
+    } | ({"sumOfWeights": repr(film.weight_sums[0])} if film.weighted else {})
 
 
 def describe_render(renderer: Renderer, source: str, started: float, preset: dict | None = None) -> dict:
@@ -159,7 +159,15 @@ def describe_render(renderer: Renderer, source: str, started: float, preset: dic
         "bytes_per_path": renderer.bytes_per_path,
         "paths_in_flight": renderer.capacity * renderer.threads,
         "warnings": renderer.warnings,
-    } | ({"guide": {"name": renderer.guide.name} | renderer.guide.statistics()} if renderer.guide else {})
+    } | ({"guide": describe_guide(renderer)} if renderer.guide else {})
+
+
+def describe_guide(renderer: Renderer) -> dict:
+    """The account of a guided render's guide, and of the weights of samples if they have any (see `Film`)."""
+    film, weights = renderer.film, {}
+    if film.weighted:
+        weights = {"sum_of_weights": film.weight_sums[0], "effective_samples_per_pixel": film.effective_samples}
+    return {"name": renderer.guide.name} | weights | renderer.guide.statistics()
 
 
 def write_film(exr: Path, renderer: Renderer, half: bool) -> None:
