@@ -179,9 +179,9 @@ def make_vmf_mixture(n_lobes: int, direction: str = "angles", log_kappa_limit: f
 
 
 @functools.cache
-def _make(K: int, direction: str, limit: float) -> VmfMixture:
-    stride = 2 + DIRECTIONS[direction]
-    to_direction, direction_gradient = _FROM_RAW[direction]
+def _make_struct(K: int) -> tuple[type, type]:
+    """A vector with an entry per lobe, and the struct: one of each for all mixtures of as many lobes. Warp takes two
+    kernels for one if they read alike, and would then meet the other struct in its arguments."""
     lobes = wp.types.vector(K, wp.float32)
 
     @wp.struct
@@ -192,6 +192,15 @@ def _make(K: int, direction: str, limit: float) -> VmfMixture:
         mu_x: lobes
         mu_y: lobes
         mu_z: lobes
+
+    return lobes, Mixture
+
+
+@functools.cache
+def _make(K: int, direction: str, limit: float) -> VmfMixture:
+    stride = 2 + DIRECTIONS[direction]
+    to_direction, direction_gradient = _FROM_RAW[direction]
+    lobes, Mixture = _make_struct(K)
 
     # A field of the struct is read once, into a variable: reading an entry of it copies the whole field wherever Warp
     # leaves a loop as it is, which is beyond 16 lobes.

@@ -1,0 +1,194 @@
+"""Renders that neural parametric mixtures guide: unbiased, robust, continued to the bit, and better.
+
+z-tests as in `tests.test_guide`: a false alarm rate of 1e-4 per comparison, with fixed seeds.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+
+from guiding.npm import NpmGuide, NpmSettings
+from tests.guiding import vmf_oracle as oracle
+from tests.test_guide import check_unbiased, film, load
+from wavefront import Renderer
+from wavefront.film import LUMINANCE
+from wavefront.scene import description as d
+
+# A grid of few parameters, for tests that are not about what is learned.
+GRID = {"n_levels": 2, "n_features": 2, "base_resolution": 4, "per_level_scale": 2.0}
+SMALL = GRID | {"n_hidden_layers": 2, "n_neurons": 32, "n_lobes": 4}
+VARIANTS = {
+    "radiance": {"product": False},
+    "product": {"product": True},
+    "all options": {
+        "product": True,
+        "direction": "vector",
+        "product_cosine": True,
+        "learned_share": True,
+        "whole_emission": True,
+        "gradient_clipping": 1.0,
+    },
+    "bare": {"product": False, "cosine_aware": False, "mis_aware": False, "sample_weighting": False, "ema": 0.0},
+}
+
+
+def npm(**settings) -> NpmGuide:
+    return NpmGuide(NpmSettings(**(SMALL | settings)), seed=1)
+
+
+# --- unbiased --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("nee", ["true", "false"])
+@pytest.mark.parametrize("name", ["cornell-box", "material-plastic"])
+def test_unbiased_while_it_trains_and_after(name, nee, variant):
+    check_unbiased(name, nee, npm(train_share=0.3, **VARIANTS[variant]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["product", "all options"])
+@pytest.mark.parametrize("nee", ["true", "false"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "coloured-glass",
+        "material-blend",
+        "material-mask",
+        "material-rough-dielectric",
+        "material-principled",
+        "material-bump-map",
+        "material-twosided",
+        "light-envmap",
+        "instances",
+    ],
+)
+def test_unbiased_with_all_materials(name, nee, variant):
+    check_unbiased(name, nee, npm(train_share=0.3, **VARIANTS[variant]), spp=1024)
+
+
+class StuckGuide(NpmGuide):
+    """Whatever the network is asked, it answers the same."""
+
+    def __init__(self, weight, kappa, mu):
+        super().__init__(NpmSettings(**SMALL, product=True, train_share=0.0, direction="vector"))
+        self.answer = oracle.encode(np.asarray(weight), np.asarray(kappa), np.asarray(mu), "vector")
+
+    def bind(self, *arguments):
+        super().bind(*arguments)
+        rows = wp.array(np.tile(self.answer, (1 << 14, 1)), dtype=wp.float32, device=self.device)
+        self.model.inference = lambda x, out, threads: wp.copy(out, rows[: out.shape[0]])
+
+
+class WildGuide(NpmGuide):
+    """A network of large random weights."""
+
+    def __init__(self):
+        super().__init__(NpmSettings(**SMALL, product=True, train_share=0.0))
+
+    def bind(self, *arguments):
+        super().bind(*arguments)
+        wild = np.random.default_rng(3).normal(size=self.model.n_params).astype(np.float32)
+        for array in (self.model.parameters, self.model.inference_parameters):
+            array.assign(wild)
+
+
+DOWN = [[0.0, -1.0, 0.01], [0.0, -1.0, 0.02], [0.01, -1.0, 0.0], [0.3, -1.0, 0.1]]
+ADVERSARIES = {
+    "below the floor": lambda: StuckGuide([0.25] * 4, [50.0] * 4, DOWN),
+    "narrow": lambda: StuckGuide([0.25] * 4, [1e6] * 4, [[1.0, 0.2, 0.1], [-1.0, 0.3, 0.2], [0.1, 1.0, 0.9], DOWN[0]]),
+    "wild": WildGuide,
+}
+
+
+@pytest.mark.parametrize("adversary", ADVERSARIES)
+@pytest.mark.parametrize("nee", ["true", "false"])
+def test_adversaries_are_unbiased(nee, adversary):
+    check_unbiased("cornell-box", nee, ADVERSARIES[adversary]())
+
+
+# --- robust ----------------------------------------------------------------------------------------------------------
+
+step = d.TransformStep
+
+
+def lamp_scene(radiance: float = 1e4, scale: float = 1.0) -> d.Scene:
+    """A floor under a lamp of 1e-3 sr."""
+    floor = d.Rectangle(
+        to_world=[step(scale=3.0 * scale), step(rotate=d.Rotate(axis=(1.0, 0.0, 0.0), angle=-90.0))],
+        bsdf=d.TwoSided(front=d.Diffuse(reflectance=0.5)),
+    )
+    radius = float(np.sqrt(1e-3 / np.pi)) * scale
+    emitter = d.Area(radiance=radiance) if radiance > 0.0 else None
+    lamp = d.Sphere(center=(0.0, scale, 0.0), radius=radius, emitter=emitter)
+    view = d.LookAt(origin=(0.0, 1.5 * scale, 3.0 * scale), target=(0.0, 0.0, 0.0))
+    return d.Scene(
+        camera=d.Perspective(fov=40.0, to_world=[step(look_at=view)]),
+        film=d.Film(width=24, height=24, aovs=["variance"], filter=d.BoxFilter()),
+        integrator=d.PathIntegrator(max_depth=4, nee=False, rr_depth=None),
+        shapes=[floor, lamp],
+    )
+
+
+def relative_variance(r: Renderer) -> float:
+    """Of the image, by its own estimate."""
+    mean = r.film.image().astype(np.float64) @ np.array(LUMINANCE)
+    return float((r.film.variance() / (mean * mean + 1e-4 * (mean * mean).mean())).mean())
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e4, 1e-4])
+@pytest.mark.parametrize("radiance", [1e4, 1e8])
+def test_a_small_bright_lamp(radiance, scale):
+    """Found, at any size of the scene and of the numbers: less than a third of the variance without a guide."""
+    scene = lamp_scene(radiance, scale)
+    guided = Renderer(scene, seed=2, guide=npm(product=True, train_share=0.5, learning_rate=0.01))
+    film(guided, 128)
+    plain = Renderer(scene, seed=2)
+    film(plain, 128)
+    assert relative_variance(guided) < relative_variance(plain) / 3.0
+    assert np.isfinite(guided.guide.model.parameters.numpy()).all()
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_black_scene(variant):
+    guide = npm(**VARIANTS[variant])
+    r = Renderer(lamp_scene(0.0), guide=guide)
+    assert film(r, 8).max() == 0.0
+    assert np.isfinite(guide.model.parameters.numpy()).all()
+    assert guide.passes == 2
+
+
+@pytest.mark.parametrize(("spp", "train_share"), [(1, 0.25), (1, 0.0), (1, 1.0), (8, 0.0), (8, 1.0)])
+def test_few_samples(spp, train_share):
+    guide = npm(product=True, train_share=train_share)
+    image = film(Renderer(load("cornell-box"), guide=guide), spp)
+    assert np.isfinite(image).all() and image.max() > 0.0
+    assert guide.passes == (0 if train_share == 0.0 else max(1, round(train_share * spp)))
+
+
+@pytest.mark.parametrize("train_share", [0.0, 0.25, 1.0])
+@pytest.mark.parametrize("name", ["cornell-box", "light-envmap", "material-plastic", "glossy-plates"])
+def test_never_much_worse(name, train_share):
+    """At equal samples and with light sampling, where a guide has little to give: less than twice the variance, which
+    is what half of the samples being useless costs."""
+    scene = load(name, 'film.aovs=["variance"]', "integrator.max_depth=6")
+    guided, plain = Renderer(scene, seed=2, guide=npm(product=True, train_share=train_share)), Renderer(scene, seed=2)
+    film(guided, 64)
+    film(plain, 64)
+    assert relative_variance(guided) < 2.0 * relative_variance(plain)
+
+
+# --- better ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_door():
+    """The room behind a door, training included: at most 0.3 of the relative squared error of an unguided render."""
+    overrides = ("integrator.nee=false", "integrator.rr_depth=null", "integrator.max_depth=11", "film.filter.type=box")
+    scene = load("door-ajar", *overrides, 'film.aovs=["variance"]', size=64)
+    guided = Renderer(scene, seed=1, guide=NpmGuide(NpmSettings(product=True, n_levels=5), seed=1))
+    plain = Renderer(scene, seed=1)
+    film(guided, 128)
+    film(plain, 128)
+    assert relative_variance(guided) < 0.3 * relative_variance(plain)
