@@ -295,7 +295,8 @@ def test_huge_learning_rate_stays_finite_with_clipping(optimizer):
     assert model.statistics["steps"] + model.statistics["skipped_batches"] == 1000
 
 
-def test_extreme_inputs():
+@pytest.mark.parametrize("execution", ["blocks", "tiles"])
+def test_extreme_inputs(execution):
     """Corners, vertices, far outside, and -0.0 stay finite; NaN and infinity are counted and keep to their rows."""
     encoding = {
         "otype": "Composite",
@@ -306,7 +307,7 @@ def test_extreme_inputs():
             {"otype": "TriangleWave"},
         ],
     }
-    model = make(encoding, n_in=6, network={"activation": "ReLU"})
+    model = make(encoding, n_in=6, network={"activation": "ReLU"}, execution=execution)
     special = np.array([0, 1, -0.0, 0.125, 0.25, -1, 2, 1e30, -1e30, 1e-40, 3.4e38, -3.4e38], np.float32)
     x = np.stack(np.meshgrid(special, special, [0.5]), -1).reshape(-1, 3)
     x = np.hstack([x, np.resize(special, (len(x), 3))]).astype(np.float32)
