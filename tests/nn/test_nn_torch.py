@@ -16,6 +16,7 @@ from test_nn_values import inputs  # noqa: E402
 
 import nn  # noqa: E402
 from nn import torch_bindings  # noqa: E402
+from nn.arrays import as_input  # noqa: E402
 from tools import bench_nn  # noqa: E402
 from tools.bench_nn import TASKS, Bench  # noqa: E402
 from tools.bench_nn_torch import Network  # noqa: E402
@@ -88,6 +89,8 @@ def test_tensors_are_shared_not_copied():
     out = torch.empty(64, 4)
     expected = model.inference(x.numpy())
     assert model.inference(x, out=out) is out
+    assert as_input(x, 3, "x", model.device).ptr == x.data_ptr()
+    assert torch_bindings.Module(model).parameters_flat.data_ptr() == model.parameters.ptr
     np.testing.assert_array_equal(out.numpy(), expected)
     y = model.inference(x.clone().requires_grad_())
     assert isinstance(y, torch.Tensor) and not y.requires_grad

@@ -11,6 +11,7 @@ from nn_models import GRID, NPM, make
 from test_nn_values import inputs
 
 import nn
+from nn.arrays import as_input
 
 ADAM = {"otype": "Adam", "learning_rate": 1e-2, "beta1": 0.9, "beta2": 0.99, "epsilon": 1e-8, "l2_reg": 1e-2}
 SGD = {"otype": "SGD", "learning_rate": 1e-2, "l2_reg": 1e-2}
@@ -255,6 +256,7 @@ def test_arrays_are_shared_not_copied():
     model = make()
     x, out = inputs(64, 3), np.empty((64, 4), np.float32)
     assert model.inference(x, out=out) is out
+    assert as_input(x, 3, "x", model.device).ptr == x.ctypes.data
     y = model.inference(wp.array(x, dtype=wp.float32))
     assert isinstance(y, wp.array)
     np.testing.assert_array_equal(y.numpy(), out)
