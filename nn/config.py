@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import math
 import os
 import re
 from collections.abc import Mapping
@@ -18,7 +19,7 @@ from typing import Annotated, Any, Literal, get_args
 
 import msgspec
 
-from nn.errors import ConfigError
+from nn.errors import ConfigError, of_file
 
 Count = Annotated[int, msgspec.Meta(ge=1, le=1 << 20)]
 Size = Annotated[int, msgspec.Meta(ge=0, le=1 << 20)]
@@ -254,13 +255,16 @@ def load(config: Mapping | str | os.PathLike | ModelConfig) -> ModelConfig:
     """
     if isinstance(config, ModelConfig):
         return config
+    if isinstance(config, (str, os.PathLike)):
+        with of_file(config):
+            return load(_read(config))
     if not isinstance(config, Mapping):
-        config = _read(config)
-    if not isinstance(config, Mapping):
-        raise ConfigError("", f"a configuration is an object; found {_shown(config)}")
+        raise ConfigError("", f"a configuration is an object, or the path of a file; found {_shown(config)}")
     raw = _check_keys(dict(config), ModelConfig, "")
     for key in ("encoding", "network", "loss", "optimizer"):
         if key == "network" and isinstance(raw.get(key), list):
+            if not raw[key]:
+                raise ConfigError(key, "found []; allowed: a list that is not empty")
             raw[key] = [_canonical(r, key, f"{key}[{i}]") for i, r in enumerate(raw[key])]
         elif key in raw:
             raw[key] = _canonical(raw[key], key, key)
@@ -280,14 +284,17 @@ def dump(config: ModelConfig) -> dict:
 def _read(path):
     try:
         text = Path(path).read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError("", f"{path}: {error.strerror}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError("", getattr(error, "strerror", None) or f"not UTF-8: {error.reason}") from None
     # Comments outside strings; the first alternative consumes strings whole.
     text = re.sub(r'("(?:\\.|[^"\\])*")|//[^\n]*', lambda match: match[1] or "", text)
     try:
-        return json.loads(text)
+        value = json.loads(text)
     except json.JSONDecodeError as error:
-        raise ConfigError("", f"{path}: line {error.lineno}: {error.msg}") from None
+        raise ConfigError("", f"line {error.lineno}: {error.msg}") from None
+    if not isinstance(value, Mapping):
+        raise ConfigError("", f"a configuration is an object; found {_shown(value)}")
+    return value
 
 
 def _canonical(raw, kind, path):
@@ -331,6 +338,8 @@ def _check_keys(raw, record, path):
             hint = f" (did you mean {close[0]!r}?)" if close else ""
             where = f"{path}.{key}" if path else str(key)
             raise ConfigError(where, f"unknown key{hint}; allowed: {', '.join(allowed)}")
+        if isinstance(raw[key], float) and not math.isfinite(raw[key]):
+            raise ConfigError(f"{path}.{key}" if path else str(key), f"found {raw[key]}; allowed: a finite number")
     for key in _ENUMERATIONS:
         if key in fields and isinstance(raw.get(key), str):
             for literal in _literals(fields[key].type):

@@ -20,7 +20,7 @@ from nn.cpu_mlp import BLOCK, n_blocks
 from nn.cpu_network import CpuNetwork
 from nn.encodings import Encoding
 from nn.encodings.kernels import count_nonfinite_rows, gather_columns
-from nn.errors import ConfigError, NnError
+from nn.errors import ConfigError, NnError, of_file
 from nn.losses import make_loss
 from nn.mlp import MLP
 from nn.tile_network import TileNetwork
@@ -135,8 +135,9 @@ class Model:
                 shared memory, by thread blocks; the default on CUDA, and on the CPU device a slow way to test it).
 
         Raises:
-            ConfigError: With the path in the configuration, what was found, and what is allowed.
+            ConfigError: With the file, the path in the configuration, what was found, and what is allowed.
         """
+        file = cfg if isinstance(cfg, (str, os.PathLike)) else None
         cfg = c.load(cfg)
         try:
             device = wp.get_device(device)
@@ -149,16 +150,15 @@ class Model:
         several = isinstance(cfg.network, list)
         dims = list(n_output_dims) if isinstance(n_output_dims, Sequence) else [n_output_dims]
         if several and len(dims) != len(cfg.network):
-            raise ConfigError(
-                "network", f"found {len(cfg.network)} networks and {len(dims)} numbers of output dimensions"
-            )
+            raise NnError(f"n_output_dims: found {dims}; allowed: a number for each of the {len(cfg.network)} networks")
         if (not several and len(dims) != 1) or any(not isinstance(n, (int, np.integer)) or n < 1 for n in dims):
             raise NnError(f"n_output_dims: found {n_output_dims}; allowed: a positive number for each network")
         if not isinstance(n_input_dims, (int, np.integer)) or n_input_dims < 1:
             raise NnError(f"n_input_dims: found {n_input_dims}; allowed: a positive number")
         tiles = execution == "tiles"
         threads = 1 if tiles else available_cores() if threads is None else max(int(threads), 1)
-        return cls(cfg, int(n_input_dims), [int(n) for n in dims], device, seed, threads, tiles)
+        with of_file(file):
+            return cls(cfg, int(n_input_dims), [int(n) for n in dims], device, seed, threads, tiles)
 
     # Inference ------------------------------------------------------------------------------------------------------
 
@@ -296,19 +296,69 @@ class Model:
             The loss: the mean over samples and outputs, summed over networks. A loss of one's own is normalised alike.
             None without `report`.
         """
-        own = loss is not None
-        if not own:
+        widths = self.n_output_dims if loss is None else [None] * len(self.networks)
+        if loss is None:
             loss = make_loss(self.config.loss.__struct_config__.tag)
+        n, losses = self._accumulate(x, target, "target", widths, loss, outputs)
+        if not report:
+            return None
+        return sum(_sum(array) / (n * self.n_output_dims[i]) for i, array in losses.items())
+
+    def train_step(
+        self,
+        x: Array,
+        target: Array | Sequence[Array] | None = None,
+        *,
+        dL_dy: Array | Sequence[Array] | None = None,
+        loss=None,
+        report: bool = True,
+    ) -> float | None:
+        """`compute_gradients` and `optimizer_step`.
+
+        Args:
+            x: Inputs.
+            target: As in `compute_gradients`.
+            dL_dy: Instead of `target`: the gradient of the caller's own loss with respect to the outputs,
+                ``[n, n_output_dims]``, or one for each network.
+            loss: As in `compute_gradients`.
+            report: As in `compute_gradients`.
+
+        Returns:
+            The loss before the step; None with `dL_dy` or without `report`.
+        """
+        if (target is None) == (dL_dy is None):
+            raise NnError("train_step: found both or neither of target and dL_dy; allowed: one of them")
+        value = None
+        if dL_dy is None:
+            value = self.compute_gradients(x, target, loss, report=report)
+        else:
+            self._accumulate(x, dL_dy, "dL_dy", self.n_output_dims, None)
+        self.optimizer_step()
+        return value
+
+    def optimizer_step(self) -> None:
+        """Updates the parameters from `gradients` and clears them; skips the batch if one of them is not finite."""
+        self.optimizer.step(self.parameters, self.gradients, self._workers.run)
+
+    def zero_gradients(self) -> None:
+        """Forgets the gradients."""
+        self.gradients.zero_()
+
+    def _accumulate(self, x, target, name, widths, loss, outputs=None):
+        """Adds the gradients of all networks, with `target` for dL/dy if there is no loss; returns the number of rows,
+        and parts of the loss of each network."""
+        several = isinstance(self.config.network, list)
+        targets = target if several else [target]
+        written = [None] * len(self.networks) if outputs is None else outputs if several else [outputs]
+        for what, arrays in ((name, targets), ("outputs", written)):
+            if not isinstance(arrays, Sequence) or len(arrays) != len(self.networks):
+                raise NnError(f"{what}: allowed: a list of {len(self.networks)} arrays, one for each network")
         for execution in self._executions:
             execution.load(loss)
         rows = as_input(x, self.n_input_dims, "x", self.device)
-        n = rows.shape[0]
-        several = isinstance(self.config.network, list)
-        targets = list(target) if several else [target]
-        written = (list(outputs) if several else [outputs]) if outputs is not None else [None] * len(self.networks)
-        jobs, finishes = {}, []
+        n, jobs, finishes = rows.shape[0], {}, []
         for i, (one, out) in enumerate(zip(targets, written, strict=True)):
-            one = as_input(one, None if own else self.n_output_dims[i], "target", self.device)
+            one = as_input(one, widths[i], name, self.device)
             check_rows(one, rows)
             y = empty((0, 0), self.device)
             if out is not None:
@@ -320,55 +370,7 @@ class Model:
             losses, _ = self._differentiate(rows, flat, nets, loss, jobs, False, encode=True)
         for finish in finishes:
             finish()
-        if not report:
-            return None
-        return sum(_sum(array) / (n * self.n_output_dims[i]) for i, array in losses.items())
-
-    def train_step(
-        self,
-        x: Array,
-        target: Array | Sequence[Array] | None = None,
-        *,
-        dL_dy: Array | None = None,
-        loss=None,
-        report: bool = True,
-    ) -> float | None:
-        """`compute_gradients` and `optimizer_step`.
-
-        Args:
-            x: Inputs.
-            target: As in `compute_gradients`.
-            dL_dy: Instead of `target`: the gradient of the caller's own loss with respect to the outputs.
-            loss: As in `compute_gradients`.
-            report: As in `compute_gradients`.
-
-        Returns:
-            The loss before the step; None with `dL_dy` or without `report`.
-        """
-        if (target is None) == (dL_dy is None):
-            raise NnError("train_step: found both or neither of target and dL_dy; allowed: one of them")
-        if dL_dy is None:
-            value = self.compute_gradients(x, target, loss, report=report)
-        else:
-            value = None
-            rows = as_input(x, self.n_input_dims, "x", self.device)
-            given = as_input(dL_dy, self.n_output_dims[0], "dL_dy", self.device)
-            check_rows(given, rows)
-            self._executions[0].load(None)
-            nothing = empty((0, 0), self.device)
-            nets = {0: self._executions[0].pack(self.parameters)}
-            with self._lend_encoded(rows.shape[0]) as flat:
-                self._differentiate(rows, flat, nets, None, {0: (given, nothing)}, False, encode=True)
-        self.optimizer_step()
-        return value
-
-    def optimizer_step(self) -> None:
-        """Updates the parameters from `gradients` and clears them; skips the batch if one of them is not finite."""
-        self.optimizer.step(self.parameters, self.gradients, self._workers.run)
-
-    def zero_gradients(self) -> None:
-        """Forgets the gradients."""
-        self.gradients.zero_()
+        return n, losses
 
     def _differentiate(self, rows, flat, nets, loss, jobs, input_gradient, encode=False):
         """Adds all gradients; returns parts of the loss of each network, and dL/dx or None."""

@@ -7,10 +7,14 @@ contiguous and of float32.
 
 from __future__ import annotations
 
-import torch
 import warp as wp
 
 from nn.model import Model
+
+try:
+    import torch
+except ImportError:
+    raise ImportError("PyTorch is not installed; it comes with pip install '.[bench]'") from None
 
 
 class Evaluate(torch.autograd.Function):

@@ -12,10 +12,11 @@ precision: half precision is autocast in PyTorch; on CUDA, PyTorch also runs flo
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import itertools
-import json
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import warp as wp
@@ -27,6 +28,7 @@ import nn
 from nn import config
 from nn.workers import available_cores
 from tools.bench_common import machine, megabytes, peak_memory_bytes, spread
+from wavefront.errors import WavefrontError
 
 _ADAM = {"otype": "Adam", "learning_rate": 1e-2, "beta1": 0.9, "beta2": 0.99, "epsilon": 1e-15, "l2_reg": 0.0}
 _MLP = {
@@ -186,6 +188,24 @@ class Bench:
         return results
 
 
+def check(options: argparse.Namespace) -> None:
+    """Refuses what cannot be measured, before anything is.
+
+    Raises:
+        WavefrontError: With the one line that the user needs.
+    """
+    for name in ("rounds", "threads"):
+        if getattr(options, name) < 1:
+            raise WavefrontError(f"--{name} {getattr(options, name)}; allowed: 1 or more")
+    for size in options.sizes or ():
+        if not 0 <= size <= 26:
+            raise WavefrontError(f"--sizes {size}; allowed: 0 to 26, for batches of 2^N samples")
+    if options.json and not options.json.resolve().parent.is_dir():
+        raise WavefrontError(f"--json {options.json}: there is no such folder")
+    if importlib.util.find_spec("torch") is None:
+        raise WavefrontError("PyTorch is not installed; it comes with pip install '.[bench]'")
+
+
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tools.bench_nn", description=__doc__.partition("\n")[0])
     parser.add_argument("--tasks", nargs="+", choices=list(TASKS), default=list(TASKS))
@@ -197,13 +217,17 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--threads", type=int, default=available_cores(), help="of all engines, on the CPU device")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--no-compile", action="store_true", help="leave out torch.compile, which needs a C++ compiler")
-    parser.add_argument("--json", metavar="FILE", help="write all figures")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
     options = parser.parse_args(arguments)
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
     try:
+        check(options)
         device = wp.get_device(options.device)
     except (RuntimeError, ValueError) as error:
         print(f"error: --device {options.device}: {error}", file=sys.stderr)
+        return 2
+    except WavefrontError as error:
+        print(f"error: {error}", file=sys.stderr)
         return 2
     on_cpu = device.is_cpu
     options.sizes = options.sizes or ([14, 16, 18] if on_cpu else list(range(14, 22)))
@@ -216,11 +240,8 @@ def main(arguments: list[str] | None = None) -> int:
     model.train_step(np.zeros((1 << largest, n_in), np.float32), np.zeros((1 << largest, n_out), np.float32))
     memory = peak_memory_bytes() if on_cpu else wp.get_mempool_used_mem_high(device)
     del model
-    try:
-        import torch
-    except ImportError:
-        print("error: PyTorch is not installed; allowed: pip install 'wavefront[bench]'", file=sys.stderr)
-        return 2
+    import torch
+
     torch.set_num_threads(options.threads)
 
     name = "cpu" if on_cpu else device.alias
@@ -262,8 +283,13 @@ def main(arguments: list[str] | None = None) -> int:
     for engine, reason in report["missing"].items():
         console.print(f"{engine}: not measured: {reason}")
     if options.json:
-        with open(options.json, "w", encoding="utf-8") as stream:
-            json.dump(report, stream, indent=1)
+        from tools.results import write_json  # here, for it would add to the memory that is measured
+
+        try:
+            write_json(options.json, report)
+        except WavefrontError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return 2
     return 0
 
 

@@ -21,6 +21,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 import nn
+from wavefront.errors import WavefrontError
+from wavefront.scene.images import replacing
 
 CONFIG = {
     "encoding": {"otype": "HashGrid", "n_levels": 16, "n_features_per_level": 2, "log2_hashmap_size": 15,
@@ -42,7 +44,7 @@ def load_image(path: str | os.PathLike) -> np.ndarray:
     try:
         with Image.open(path) as image:
             return np.asarray(image.convert("RGB"), np.float32) / 255
-    except (OSError, UnidentifiedImageError) as error:
+    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
         raise nn.NnError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
 
 
@@ -101,12 +103,17 @@ class Fit:
 
 
 def save(path: Path, image: np.ndarray) -> None:
-    partial = path.with_name(path.name + ".part")
-    Image.fromarray((np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)).save(partial, format="PNG")
-    os.replace(partial, path)
+    """Writes a PNG.
+
+    Raises:
+        WavefrontError: It cannot be written.
+    """
+    with replacing(path) as temporary:
+        Image.fromarray((np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)).save(temporary, format="PNG")
 
 
 def main(arguments: list[str] | None = None) -> int:
+    """The command; returns its exit status."""
     parser = argparse.ArgumentParser(prog="python -m tools.fit_image", description=__doc__.partition("\n")[0])
     parser.add_argument("image", help="PNG or JPEG")
     parser.add_argument("-o", "--output", default="fit", metavar="FOLDER", help="of the PNG sequence (default: fit)")
@@ -116,17 +123,32 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", default="cpu", help="of Warp: cpu (the default) or cuda")
     options = parser.parse_args(arguments)
-    console = Console()
     try:
-        for name in ("steps", "batch"):
-            if getattr(options, name) < 1:
-                raise nn.NnError(f"--{name}: found {getattr(options, name)}; allowed: a positive number")
-        fit = Fit(load_image(options.image), options.config or CONFIG, options.batch, options.seed, options.device)
-        folder = Path(options.output)
-        folder.mkdir(parents=True, exist_ok=True)
-    except (nn.NnError, OSError) as error:
+        run(options)
+    except (nn.NnError, WavefrontError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    return 0
+
+
+def run(options: argparse.Namespace) -> None:
+    """Trains, and shows and writes what the network knows.
+
+    Raises:
+        nn.NnError: An option, the image or the configuration is not allowed.
+        WavefrontError: A picture cannot be written.
+    """
+    for name in ("steps", "batch"):
+        if getattr(options, name) < 1:
+            raise nn.NnError(f"--{name}: found {getattr(options, name)}; allowed: a positive number")
+    if options.seed < 0:
+        raise nn.NnError(f"--seed: found {options.seed}; allowed: 0 or more")
+    fit = Fit(load_image(options.image), options.config or CONFIG, options.batch, options.seed, options.device)
+    folder = Path(options.output)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise WavefrontError(f"{folder}: cannot be written: {error.strerror}") from None
     pictures = {2**k for k in range(options.steps.bit_length())} | {options.steps}
     columns = [
         TextColumn("{task.description}"),
@@ -135,7 +157,7 @@ def main(arguments: list[str] | None = None) -> int:
         TimeRemainingColumn(),
     ]
     seconds = 0.0
-    with Progress(*columns, console=console) as progress:
+    with Progress(*columns, console=Console(highlight=False)) as progress:
         task = progress.add_task("training", total=options.steps)
         for step in range(1, options.steps + 1):
             start = time.perf_counter()
@@ -144,11 +166,10 @@ def main(arguments: list[str] | None = None) -> int:
             if step in pictures:
                 picture = fit.picture()
                 save(folder / f"{step:06d}.png", picture)
-                console.print(
+                progress.console.print(
                     f"step {step:6d}  loss {loss:.3e}  PSNR {psnr(picture, fit.image):.2f} dB  {seconds:.2f} s"
                 )
             progress.update(task, advance=1, description=f"loss {loss:.2e}")
-    return 0
 
 
 if __name__ == "__main__":

@@ -42,11 +42,18 @@ def test_command(tmp_path, capsys):
     [
         (["absent.png"], "error: absent.png: No such file or directory\n"),
         (["absent.png", "--steps", "0"], "error: --steps: found 0; allowed: a positive number\n"),
+        (["absent.png", "--seed", "-1"], "error: --seed: found -1; allowed: 0 or more\n"),
     ],
 )
 def test_errors_are_one_line(arguments, words, capsys):
     assert fit_image.main(arguments) == 2
     assert capsys.readouterr().err == words
+
+
+def test_a_folder_that_cannot_be_is_named(tmp_path, capsys):
+    Image.new("RGB", (4, 4)).save(tmp_path / "a.png")
+    assert fit_image.main([str(tmp_path / "a.png"), "-o", str(tmp_path / "a.png")]) == 2
+    assert capsys.readouterr().err == f"error: {tmp_path / 'a.png'}: cannot be written: File exists\n"
 
 
 def test_an_unknown_device_is_named(tmp_path, capsys):

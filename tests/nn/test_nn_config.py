@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import re
 
 import pytest
 from nn_models import NPM
@@ -64,6 +65,35 @@ def test_round_trip_and_comments(tmp_path):
         config.load(tmp_path / "absent.json")
 
 
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (b'{"network": {"otype": "MLP", "width": 64}}', r"^{file}: network\.width: unknown key; allowed: otype, "),
+        (
+            b'{"loss": {"otype": "L2"}, "precision": 16}',
+            r'^{file}: precision: found 16; allowed: "fp32", "fp16", "bf16"$',
+        ),
+        (
+            b'{"network": {"otype": "MLP", "n_parts": 2}}',
+            r"^{file}: network\.n_parts: found 2; the encoding has 1 parts$",
+        ),
+        (b'{"encoding": "\xff"}', r"^{file}: not UTF-8: invalid start byte$"),
+        (b"[1]", r"^{file}: a configuration is an object; found \[1\]$"),
+    ],
+)
+def test_a_wrong_file_is_named(tmp_path, text, words):
+    file = tmp_path / "model.json"
+    file.write_bytes(text)
+    with pytest.raises(nn.ConfigError, match=words.format(file=re.escape(str(file)))):
+        nn.Model.from_config(file, 3, 4)
+
+
+@pytest.mark.parametrize("value", [[], None, 3])
+def test_what_is_no_configuration(value):
+    with pytest.raises(nn.ConfigError, match=r"^a configuration is an object, or the path of a file; found"):
+        config.load(value)
+
+
 def changed(path, value):
     result = copy.deepcopy(NPM)
     *owners, last = path
@@ -86,6 +116,13 @@ WRONG = [
     (["network", "activation"], "Relu6", r'^network\.activation: found "Relu6"; allowed: "None", "ReLU"'),
     (["network", "feedback_alignment"], True, r"^network\.feedback_alignment: found true; allowed: false"),
     (["network"], 3, r"^network: expected an object; found 3"),
+    (["network"], [], r"^network: found \[\]; allowed: a list that is not empty"),
+    (["loss_scale"], float("inf"), r"^loss_scale: found inf; allowed: a finite number"),
+    (
+        ["optimizer", "nested", "learning_rate"],
+        float("nan"),
+        r"^optimizer\.nested\.learning_rate: found nan; allowed: a f",
+    ),
     (["encoding", "nested", 1, "degree"], 9, r"^encoding\.nested\[1\]\.degree: found 9; allowed: .* <= 8"),
     (["encoding", "nested", 2, "bins"], 4, r"^encoding\.nested\[2\]\.bins: unknown key .*allowed: otype, n_bins"),
     (["encoding", "nested", 0, "n_features_per_level"], 3, r"n_features_per_level: found 3; allowed: 1, 2, 4, 8"),

@@ -14,7 +14,7 @@ import nn
 from nn import config
 
 ACTIVATIONS = ["None", "ReLU", "LeakyReLU", "SiLU", "Sigmoid", "Tanh", "Softplus", "Squareplus", "Exponential", "Sine"]
-LOSSES = ["L1", "L2", "RelativeL1", "RelativeL2", "MAPE", "SMAPE"]
+LOSSES = ["L1", "L2", "RelativeL1", "RelativeL2", "RelativeL2Luminance", "MAPE", "SMAPE", "CrossEntropy", "Variance"]
 
 # Grids of few kinds, each of which is a build of kernels.
 grids = st.builds(
@@ -64,6 +64,7 @@ def models(draw):
         "optimizer": draw(optimizers),
         "precision": draw(st.sampled_from(["fp32", "fp16", "bf16"])),
         "loss_scale": draw(st.sampled_from([1.0, 128.0, "dynamic"])),
+        "gradient_clipping": draw(st.sampled_from([None, {"global_norm": 0.01}])),
     }, dims
 
 
@@ -72,6 +73,8 @@ def models(draw):
 def test_contract(tmp_path_factory, described, n_out, n):
     description, dims = described
     cfg = config.load(json.loads(json.dumps(description)))
+    if description["loss"]["otype"] == "RelativeL2Luminance":
+        n_out = 3 * n_out
     assert config.load(config.dump(cfg)) == cfg
 
     rng = np.random.default_rng(n)

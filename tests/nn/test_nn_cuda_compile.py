@@ -41,9 +41,10 @@ def check(folder, count):
     assert all(path.stat().st_size > 500 for path in built)
 
 
-def test_encodings_and_optimisers_compile_for_cuda(tmp_path):
+@pytest.mark.parametrize("arch", [pytest.param(80, marks=pytest.mark.slow), 90])
+def test_encodings_and_optimisers_compile_for_cuda(tmp_path, arch):
     for kernel in [*SHARED, make_grid_kernels(3, 2, "Smoothstep", True)[0]]:
-        compile_for_cuda(kernel, 90, tmp_path)
+        compile_for_cuda(kernel, arch, tmp_path)
     check(tmp_path, len(SHARED) + 1)
 
 

@@ -165,8 +165,22 @@ def test_networks_that_share_an_encoding():
     assert loss == pytest.approx(total(), rel=1e-6)
     expected = numerical(total, values, model.gradients.numpy())
     check(model.gradients.numpy(), expected, np.abs(expected).max())
-    for i in range(2):
-        np.testing.assert_allclose(model.inference(x, network=i), oracle.forward(x, values, i)[0], rtol=1e-5, atol=1e-6)
+    outputs = [model.inference(x, network=i) for i in range(2)]
+    for i, y in enumerate(outputs):
+        np.testing.assert_allclose(y, oracle.forward(x, values, i)[0], rtol=1e-5, atol=1e-6)
+    other = make(encoding, networks, n_in=4, n_out=[2, 3])
+    slopes = [(2 * (y - t) / y.size).astype(np.float32) for y, t in zip(outputs, targets, strict=True)]
+    for trained, arguments in ((model, {"target": targets}), (other, {"dL_dy": slopes})):
+        trained.zero_gradients()
+        trained.optimizer_step = lambda: None
+        trained.train_step(x, **arguments)
+    largest = np.abs(expected).max()
+    np.testing.assert_allclose(other.gradients.numpy(), model.gradients.numpy(), rtol=0, atol=2e-6 * largest)
+    for arguments, name in (({"target": targets[:1]}, "target"), ({"dL_dy": x}, "dL_dy")):
+        with pytest.raises(nn.NnError, match=f"{name}: allowed: a list of 2 arrays, one for each network"):
+            model.train_step(x, **arguments)
+    with pytest.raises(nn.NnError, match=r"n_output_dims: found \[2\]; allowed: a number for each of the 2 networks"):
+        make(encoding, networks, n_in=4, n_out=[2])
 
 
 def test_given_gradient_equals_loss_gradient():

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
+import json
+import sys
+
 import numpy as np
 import pytest
 
@@ -12,6 +16,8 @@ from test_nn_values import inputs  # noqa: E402
 
 import nn  # noqa: E402
 from nn import torch_bindings  # noqa: E402
+from nn.arrays import as_input  # noqa: E402
+from tools import bench_nn  # noqa: E402
 from tools.bench_nn import TASKS, Bench  # noqa: E402
 from tools.bench_nn_torch import Network  # noqa: E402
 
@@ -83,6 +89,8 @@ def test_tensors_are_shared_not_copied():
     out = torch.empty(64, 4)
     expected = model.inference(x.numpy())
     assert model.inference(x, out=out) is out
+    assert as_input(x, 3, "x", model.device).ptr == x.data_ptr()
+    assert torch_bindings.Module(model).parameters_flat.data_ptr() == model.parameters.ptr
     np.testing.assert_array_equal(out.numpy(), expected)
     y = model.inference(x.clone().requires_grad_())
     assert isinstance(y, torch.Tensor) and not y.requires_grad
@@ -107,3 +115,41 @@ def test_benchmark_runs():
         errors[precision] = bench.error["ours"]
         assert results["training"]["ours"]["samples_per_second"] > 0
     assert errors["fp32"] < 1e-5 < errors["fp16"] < 1e-2
+
+
+def test_benchmark_command(tmp_path, capsys):
+    file = tmp_path / "figures.json"
+    arguments = ["--tasks", "image", "--sizes", "6", "--rounds", "1", "--threads", "1", "--no-compile"]
+    assert bench_nn.main([*arguments, "--json", str(file)]) == 0
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert [line[:5] for line in lines if line[:1] == ["image"]] == [
+        ["image", mode, "fp32", engine, "2^6"] for mode in ("training", "inference") for engine in ("ours", "eager")
+    ]
+    (result,) = json.loads(file.read_text())["results"]
+    figure = result["inference"]["ours"]
+    assert figure["samples_per_second"] == pytest.approx(64 / figure["seconds"]["median"])
+    assert [path.name for path in tmp_path.iterdir()] == ["figures.json"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--rounds", "0"], "--rounds 0; allowed: 1 or more"),
+        (["--sizes", "14", "40"], "--sizes 40; allowed: 0 to 26, for batches of 2^N samples"),
+        (["--json", "absent/file.json"], "--json absent/file.json: there is no such folder"),
+    ],
+)
+def test_errors_of_the_benchmark_are_one_line(arguments, words, capsys):
+    assert bench_nn.main(arguments) == 2
+    assert capsys.readouterr().err == f"error: {words}\n"
+
+
+def test_without_torch_its_extra_is_named(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.delitem(sys.modules, "nn.torch_bindings")
+    words = "PyTorch is not installed; it comes with pip install '.[bench]'"
+    assert bench_nn.main([]) == 2
+    assert capsys.readouterr().err == f"error: {words}\n"
+    with pytest.raises(ImportError) as caught:
+        importlib.import_module("nn.torch_bindings")
+    assert str(caught.value) == words

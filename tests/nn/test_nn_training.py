@@ -11,6 +11,7 @@ from nn_models import GRID, NPM, make
 from test_nn_values import inputs
 
 import nn
+from nn.arrays import as_input
 
 ADAM = {"otype": "Adam", "learning_rate": 1e-2, "beta1": 0.9, "beta2": 0.99, "epsilon": 1e-8, "l2_reg": 1e-2}
 SGD = {"otype": "SGD", "learning_rate": 1e-2, "l2_reg": 1e-2}
@@ -255,6 +256,7 @@ def test_arrays_are_shared_not_copied():
     model = make()
     x, out = inputs(64, 3), np.empty((64, 4), np.float32)
     assert model.inference(x, out=out) is out
+    assert as_input(x, 3, "x", model.device).ptr == x.ctypes.data
     y = model.inference(wp.array(x, dtype=wp.float32))
     assert isinstance(y, wp.array)
     np.testing.assert_array_equal(y.numpy(), out)
@@ -295,7 +297,8 @@ def test_huge_learning_rate_stays_finite_with_clipping(optimizer):
     assert model.statistics["steps"] + model.statistics["skipped_batches"] == 1000
 
 
-def test_extreme_inputs():
+@pytest.mark.parametrize("execution", ["blocks", "tiles"])
+def test_extreme_inputs(execution):
     """Corners, vertices, far outside, and -0.0 stay finite; NaN and infinity are counted and keep to their rows."""
     encoding = {
         "otype": "Composite",
@@ -306,7 +309,7 @@ def test_extreme_inputs():
             {"otype": "TriangleWave"},
         ],
     }
-    model = make(encoding, n_in=6, network={"activation": "ReLU"})
+    model = make(encoding, n_in=6, network={"activation": "ReLU"}, execution=execution)
     special = np.array([0, 1, -0.0, 0.125, 0.25, -1, 2, 1e30, -1e30, 1e-40, 3.4e38, -3.4e38], np.float32)
     x = np.stack(np.meshgrid(special, special, [0.5]), -1).reshape(-1, 3)
     x = np.hstack([x, np.resize(special, (len(x), 3))]).astype(np.float32)

@@ -59,6 +59,23 @@ def test_one_blob_sums_to_one_on_the_circle():
     np.testing.assert_allclose(sums, 1, atol=2e-6)
 
 
+@pytest.mark.parametrize("execution", ["blocks", "tiles"])
+@pytest.mark.parametrize("interpolation", ["Linear", "Smoothstep"])
+def test_vertices_of_a_grid(interpolation, execution):
+    """There the features are those of the vertex and no other's, to the last bit, and so are their gradients."""
+    grid = {"otype": "DenseGrid", "n_levels": 1, "n_features_per_level": 2, "base_resolution": 5,
+            "interpolation": interpolation}  # fmt: skip
+    model = make(grid, n_in=2, n_out=2, network={"n_hidden_layers": 0}, execution=execution)
+    table = model.parameters.numpy()[-model.encoding.n_params :].reshape(-1, 2)
+    i, j = np.mgrid[1:5, 1:5].reshape(2, -1)
+    x = ((np.stack([i, j], 1) - 0.5) / 4).astype(np.float32)  # a point lies at 4 x + 1/2; exact in binary
+    np.testing.assert_array_equal(model.encode(0, x), table[i + 5 * j])
+    model.forward(x[3:4])
+    model.backward(np.ones((1, 2), np.float32))
+    touched = model.gradients.numpy()[-model.encoding.n_params :].reshape(-1, 2).any(axis=1)
+    np.testing.assert_array_equal(np.flatnonzero(touched), [i[3] + 5 * j[3]])
+
+
 @pytest.mark.parametrize("name", activations.NAMES)
 def test_activation_of_hidden_and_output_layers(name):
     span = 1 if name == "Exponential" else 4  # exponentials of exponentials overflow
