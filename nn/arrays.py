@@ -17,15 +17,18 @@ def is_tensor(array: object) -> bool:
     return hasattr(array, "__torch_function__")
 
 
-def as_input(array: Array, width: int, name: str, device) -> wp.array:
+def as_input(array: Array, width: int | None, name: str, device) -> wp.array:
     """A contiguous float32 array ``[n, width]`` that shares the memory of `array` if that is such an array.
+
+    A `width` of None allows any but 0.
 
     Raises:
         NnError: Kind, shape, type or device are not allowed; `name` is what the message calls it.
     """
     shape = tuple(getattr(array, "shape", ()))
-    if len(shape) != 2 or shape[1] != width:
-        raise NnError(f"{name}: found shape {shape}; allowed: [n, {width}]")
+    if len(shape) != 2 or (shape[1] != width if width is not None else shape[1] < 1):
+        allowed = "1 or more" if width is None else width
+        raise NnError(f"{name}: found shape {shape}; allowed: [n, {allowed}]")
     if is_tensor(array) and str(array.dtype) == "torch.float32":
         array = wp.from_torch(array.detach().contiguous(), requires_grad=False)
     if isinstance(array, wp.array):
@@ -39,7 +42,7 @@ def as_input(array: Array, width: int, name: str, device) -> wp.array:
         raise NnError(f"{name}: found {array.dtype}; allowed: float32")
     array = np.ascontiguousarray(array, np.float32)
     if array.shape[0] == 0:
-        return empty((0, width), device)
+        return empty((0, shape[1]), device)
     return wp.array(array, dtype=wp.float32, device=device, copy=False)
 
 

@@ -1,8 +1,9 @@
 """Losses: the mean over samples and outputs of a function of prediction y and target t, and its gradient.
 
 A loss for the training kernels is a ``wp.func(y, y_offset, target, row, factor, dL_dy, dL_dy_offset) -> float`` that
-returns the sum over the outputs of one row and writes `factor` times its gradient; `make_loss` builds those of the
-schema, and a caller may pass its own.
+returns the sum over the outputs of one row and writes `factor` times its gradient, from `dL_dy_offset` on, with respect
+to each output. `make_loss` builds those of the schema, whose targets are as wide as the outputs. A caller may pass its
+own; its targets have the columns that it reads, ``target.shape[1]`` of them, which it must not read beyond.
 """
 
 import functools

@@ -174,6 +174,7 @@ class Model:
         network: int = 0,
         latents: Mapping[int, tuple[Array, Array]] | None = None,
         averaged: bool = True,
+        threads: int | None = None,
     ) -> Array:
         """Evaluates a network; several threads may do so at once.
 
@@ -184,6 +185,7 @@ class Model:
             latents: Per index of a part, a result of `encode` and an int32 array of `n` row numbers of it: the part is
                 copied from there instead of being encoded from its columns of `x`, which are ignored.
             averaged: Use the moving average of the parameters, if there is one.
+            threads: 1: in the calling thread alone, for callers that are many; None: as many as the model has.
 
         Returns:
             Outputs ``[n, n_output_dims]``.
@@ -197,10 +199,10 @@ class Model:
             latent = as_input(latent, piece.n_features, name, self.device)
             found[part] = (latent, as_index(index, rows.shape[0], latent.shape[0], name, self.device))
         with self._lend_encoded(rows.shape[0]) as flat:
-            self._evaluate(rows, flat, parameters, network, y, found)
+            self._evaluate(rows, flat, parameters, network, y, found, alone=threads == 1)
         return finish()
 
-    def _evaluate(self, rows, flat, parameters, network, y, latents=None):
+    def _evaluate(self, rows, flat, parameters, network, y, latents=None, alone=False):
         """Outputs of a network into `y`, and features into `flat`; returns the packed network."""
         execution, n, encoded = self._executions[network], rows.shape[0], self._as_rows(flat)
         net = execution.pack(parameters)
@@ -212,7 +214,10 @@ class Model:
                 self._encode(rows, row, end, worker, parameters, encoded, latents, n_parts)
                 execution.infer(net, flat, row, end, worker, scratch, y)
 
-            self._workers.run(work, n_blocks(n), 16)
+            if alone:
+                work(0, n_blocks(n), 0)
+            else:
+                self._workers.run(work, n_blocks(n), 16)
         return net
 
     def encode(self, part: int, x: Array, averaged: bool = True) -> Array:
@@ -282,7 +287,7 @@ class Model:
 
         Args:
             x: Inputs ``[n, n_input_dims]``.
-            target: ``[n, n_output_dims]``, or one for each network.
+            target: ``[n, n_output_dims]``, or one for each network. A loss of one's own takes any number of columns.
             loss: A loss of one's own (see `nn.losses`); None: the one of the configuration.
             outputs: Where to write the outputs, if they are wanted.
             report: False: do not read the loss back, which waits for a GPU.
@@ -291,7 +296,8 @@ class Model:
             The loss: the mean over samples and outputs, summed over networks. A loss of one's own is normalised alike.
             None without `report`.
         """
-        if loss is None:
+        own = loss is not None
+        if not own:
             loss = make_loss(self.config.loss.__struct_config__.tag)
         for execution in self._executions:
             execution.load(loss)
@@ -302,7 +308,7 @@ class Model:
         written = (list(outputs) if several else [outputs]) if outputs is not None else [None] * len(self.networks)
         jobs, finishes = {}, []
         for i, (one, out) in enumerate(zip(targets, written, strict=True)):
-            one = as_input(one, self.n_output_dims[i], "target", self.device)
+            one = as_input(one, None if own else self.n_output_dims[i], "target", self.device)
             check_rows(one, rows)
             y = empty((0, 0), self.device)
             if out is not None:
@@ -331,7 +337,7 @@ class Model:
 
         Args:
             x: Inputs.
-            target: Of the loss.
+            target: As in `compute_gradients`.
             dL_dy: Instead of `target`: the gradient of the caller's own loss with respect to the outputs.
             loss: As in `compute_gradients`.
             report: As in `compute_gradients`.

@@ -87,7 +87,8 @@ def make_functions(shape: Shape):
         depth: int  # hidden layers
         n_in: int  # blocks of features
         n_out: int  # blocks of outputs
-        n_blocks: int  # in all
+        n_outputs: int  # their columns
+        n_blocks: int  # of weights, in all
 
     @wp.func
     def operand(x: wp.float32):
@@ -279,13 +280,13 @@ def make_train_kernel(shape: Shape, loss):
         n_rows: int,
         lane: int,
         base: int,
+        n_out: int,
         target: wp.array2d[wp.float32],
         factor: wp.float32,
         scratch: Scratch,
         y: wp.array2d[wp.float32],
     ):
         """Outputs, loss, and gradients with respect to the sums of the last layer, of the rows of one thread."""
-        n_out = target.shape[1]
         stride = scratch.sums.shape[1]
         total = wp.float64(0.0)
         r = int(lane)
@@ -360,7 +361,7 @@ def make_train_kernel(shape: Shape, loss):
                 output_layer(features, row, net, block, h, z)
                 store_sums(z, scratch.sums, base, block)
             synchronize()
-            total += differentiate_rows(row, n_rows, lane, base, target, factor, scratch, y)
+            total += differentiate_rows(row, n_rows, lane, base, net.n_outputs, target, factor, scratch, y)
             synchronize()
             for block in range(net.n_out):
                 load_operand(scratch.gradients, base, block, g)

@@ -84,6 +84,7 @@ class TileNetwork:
         net.weights = wp.zeros((self.n_blocks * width, width), dtype=shape.dtype, device=self.device)
         net.biases = wp.zeros((self.bias_source.size // width, width), dtype=wp.float32, device=self.device)
         net.depth, net.n_in, net.n_out, net.n_blocks = self.depth, self.n_in, self.n_out, self.n_blocks
+        net.n_outputs = self.mlp.n_out
         pairs = [(self.pack_kernel, self.weight_source, net.weights)]
         if shape.bias:
             pairs.append((make_pack_kernel(wp.float32), self.bias_source, net.biases))

@@ -44,6 +44,7 @@ class Features:
     # Path guiding
     guide: tuple = ()  # name of the guide, and what tells its kernels from others of that name; empty without a guide
     guide_pdf: bool = True  # the guide has a density
+    guide_inputs: tuple[str, ...] = ()  # what the guide asks to know of surfaces, see `wavefront.proposals`
     records: tuple[str, ...] = ()  # fields of the records that the guide trains with; empty if it asks for none
 
     @property

@@ -30,12 +30,14 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import warp as wp
 
 from wavefront.errors import WavefrontError
-from wavefront.proposals import Proposals
+from wavefront.proposals import INPUTS, Proposals
 from wavefront.queues import Paths, Queue, Surfaces
 from wavefront.recording import FIELDS, RecordRequest, Records
 
@@ -50,6 +52,24 @@ DIRECTIONS = "directions"
 
 
 @dataclasses.dataclass(frozen=True)
+class GuideVertex:
+    """A vertex that a guide is asked about from outside of a render. World space.
+
+    Attributes:
+        position: vec3, metres.
+        normal: vec3, unit length: shading normal.
+        wo: vec3, unit length: towards the viewer.
+        roughness, transmits: As `wavefront.proposals.INPUTS`.
+    """
+
+    position: Sequence[float]
+    normal: Sequence[float]
+    wo: Sequence[float]
+    roughness: float = 1.0
+    transmits: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
 class GuideContext:
     """What the state of a guide works on: the arrays of one worker, which owns them.
 
@@ -61,7 +81,7 @@ class GuideContext:
         seed: Of the random numbers.
         paths: State of the paths, by slot; `direction` is that of the ray which arrived, `-wo`. To be read only.
         surfaces: The vertices, by slot; `shading_normal` is that of the BSDF. To be read only.
-        proposals: By slot. A guide may write `share` in `prepare`, `wi` and, without a density, `guide_pdf` in
+        proposals: By slot, with the `inputs` that the guide asked for. A guide may write `share` in `prepare`, `wi` and, without a density, `guide_pdf` in
             `propose`; no more.
         counters: `counters[wavefront.queues.DEPTH]` is the number of scatterings so far.
     """
@@ -135,7 +155,9 @@ class Guide(ABC):
         rounds: Calls of `GuideState.propose` per bounce, 1 or more.
         bsdf_share: Probability of sampling the BSDF where `GuideState.prepare` does not say otherwise; more than 0, at
             most 1. No guide is trusted with all samples: what it never proposes is found by the BSDF.
+        inputs: What the guide asks to know of the surface at a vertex, keys of `wavefront.proposals.INPUTS`.
         records: What training needs; None for a guide that does not learn.
+        threads: Set by the renderer before `bind`: how many threads of the CPU device may train; None: all cores.
     """
 
     name: str
@@ -143,7 +165,9 @@ class Guide(ABC):
     has_pdf: bool = True
     rounds: int = 1
     bsdf_share: float = 0.5
+    inputs: tuple[str, ...] = ()
     records: RecordRequest | None = None
+    threads: int | None = None
 
     @abstractmethod
     def bind(self, scene: Scene, device_scene: DeviceScene, features: Features, device: str) -> None:
@@ -202,6 +226,18 @@ class Guide(ABC):
     def restored(self) -> None:  # noqa: B027 (most guides have nothing to do)
         """Called after `arrays` were filled from a checkpoint."""
 
+    def query(self, vertex: GuideVertex, directions: np.ndarray) -> np.ndarray:
+        """The density in solid angle that the guide, as it is now, would propose directions with: for pictures of it.
+
+        Args:
+            vertex: Where.
+            directions: Unit vectors, float32 [n, 3].
+
+        Returns:
+            float32 [n].
+        """
+        raise NotImplementedError("a guide without a density has none to show")
+
     def statistics(self) -> dict[str, Any]:
         """What a user may want to know of the guide so far, as plain JSON values."""
         return {}
@@ -217,7 +253,15 @@ def check_guide(guide: Guide) -> None:
         raise WavefrontError(f"guide {guide.name}: a BSDF share of {guide.bsdf_share}; allowed: more than 0, up to 1")
     if guide.rounds < 1:
         raise WavefrontError(f"guide {guide.name}: {guide.rounds} rounds of proposals; allowed: 1 or more")
+    unknown = [name for name in guide.inputs if name not in INPUTS]
+    if unknown:
+        raise WavefrontError(f"guide {guide.name}: inputs {', '.join(unknown)}; allowed: {', '.join(INPUTS)}")
     if guide.records is not None:
+        missing = [name for name in guide.records.fields if name in INPUTS and name not in guide.inputs]
+        if missing:
+            raise WavefrontError(
+                f"guide {guide.name}: records of {', '.join(missing)}; allowed: only with inputs of the same name"
+            )
         unknown = [name for name in guide.records.fields if name not in FIELDS]
         if unknown or not guide.records.fields:
             raise WavefrontError(

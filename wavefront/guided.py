@@ -32,7 +32,7 @@ def make_guided_kernels(f: Features) -> dict[str, wp.Kernel]:
     bsdf = f.bsdfs, f.mask, f.textures
     frame = f.uvs, f.tangents, f.maps
     kernels = {
-        "vertices": make_guided_vertices(*bsdf, f.uvs, f.mixed_deltas),
+        "vertices": make_guided_vertices(*bsdf, f.uvs, f.mixed_deltas, f.guide_inputs),
         "propose": make_guided_propose(*bsdf, *frame, f.transmission, f.sampler, f.mixed_deltas),
         "directions": make_guided_evaluate(*bsdf, *frame, f.transmission),
         "resolve": make_guided_resolve(

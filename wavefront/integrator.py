@@ -22,7 +22,7 @@ from wavefront.errors import WavefrontError
 from wavefront.features import Features
 from wavefront.film import FIRST_HIT, Film, film_arrays, make_window
 from wavefront.guide import Guide
-from wavefront.proposals import LightProposals, Proposals
+from wavefront.proposals import INPUTS, LightProposals, Proposals
 from wavefront.queues import Paths, QueueSet, ShadowRays, Surfaces, allocate_struct, bytes_per_slot
 from wavefront.recording import RecordScratch, scratch_arrays
 from wavefront.scene import description
@@ -72,6 +72,7 @@ def make_features(scene: description.Scene, device_scene: DeviceScene, guide: Gu
         variance="variance" in scene.film.aovs,
         guide=(guide.name, *guide.key) if guide is not None else (),
         guide_pdf=guide is None or guide.has_pdf,
+        guide_inputs=guide.inputs if guide is not None else (),
         records=guide.records.fields if guide is not None and guide.records is not None else (),
     )
 
@@ -160,7 +161,9 @@ def skipped_guided_arrays(f: Features) -> dict[type, tuple[str, ...]]:
     scratch = scratch_arrays(f.records, f.light_sampling)
     lights = () if f.guide_pdf else ("guide_pdf",)
     return {
-        Proposals: (() if f.transmission else ("eta",)) + (() if f.mixed_deltas else ("delta",)),
+        Proposals: (() if f.transmission else ("eta",))
+        + (() if f.mixed_deltas else ("delta",))
+        + tuple(name for name in INPUTS if name not in f.guide_inputs),
         LightProposals: lights if f.light_sampling else tuple(LightProposals.vars),
         RecordScratch: tuple(name for name in RecordScratch.vars if name not in scratch),
     }

@@ -20,12 +20,18 @@ MIN_SHARE = wp.constant(0.01)  # of BSDF sampling, whatever a guide asks for: ev
 TECHNIQUE_BSDF = wp.constant(0)
 TECHNIQUE_GUIDE = wp.constant(1)
 
+# What a guide may ask to know of the surface at a vertex, by type; arrays of `Proposals` that are filled before the
+# guide prepares.
+INPUTS = {"roughness": wp.float32, "transmits": wp.int32}
+
 
 @wp.struct
 class Proposals:
     """The vertex's proposal for the next direction, one entry per slot."""
 
     share: wp.array[wp.float32]  # that the guide asks for; 1 where a guide has no say
+    roughness: wp.array[wp.float32]  # see `bsdf.roughness`; allocated if the guide asks
+    transmits: wp.array[wp.int32]  # 1: light comes from both sides; allocated if the guide asks
     delta: wp.array[wp.float32]  # probability of a delta; allocated if a surface may have those and other directions
     technique: wp.array[wp.int32]
     wi: wp.array[wp.vec3]  # unit length; a guide that has none to offer proposes zero, which ends the path

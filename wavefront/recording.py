@@ -33,6 +33,9 @@ FIELDS = {
     "wi": wp.vec3,
     "pdf": wp.float32,
     "guide_pdf": wp.float32,
+    "bsdf_pdf": wp.float32,
+    "roughness": wp.float32,
+    "transmits": wp.int32,
     "weight": wp.vec3,
     "survival": wp.float32,
     "radiance": wp.vec3,
@@ -88,6 +91,9 @@ class Rows:
     wi: wp.array[wp.vec3]
     pdf: wp.array[wp.float32]
     guide_pdf: wp.array[wp.float32]
+    bsdf_pdf: wp.array[wp.float32]
+    roughness: wp.array[wp.float32]
+    transmits: wp.array[wp.int32]
     weight: wp.array[wp.vec3]
     survival: wp.array[wp.float32]
 
@@ -114,6 +120,9 @@ class RecordArrays:
     wi: wp.array[wp.vec3]
     pdf: wp.array[wp.float32]
     guide_pdf: wp.array[wp.float32]
+    bsdf_pdf: wp.array[wp.float32]
+    roughness: wp.array[wp.float32]
+    transmits: wp.array[wp.int32]
     weight: wp.array[wp.vec3]
     survival: wp.array[wp.float32]
     radiance: wp.array[wp.vec3]
@@ -140,6 +149,9 @@ class Records:
             that of the BSDF (see `proposals.make_scatter_pdf`).
         guide_pdf: float32: density of the guide at `wi`, zero where the guide had no say. Of a guide without a density,
             the weight of its contribution where it proposed `wi`, else zero.
+        bsdf_pdf: float32: density of BSDF sampling at `wi`.
+        roughness: float32, in [0, 1]: see `wavefront.bsdf.roughness`.
+        transmits: int32: 1 if light comes from both sides of the surface.
         weight: vec3: f |cos| / p, as it went into the throughput, without Russian roulette.
         survival: float32: probability with which Russian roulette let the path go on; 1 without. Paths that it ended
             leave no record of the vertex: a sum over records that shall not depend on roulette divides by this.
@@ -161,6 +173,9 @@ class Records:
     wi: wp.array | None = None
     pdf: wp.array | None = None
     guide_pdf: wp.array | None = None
+    bsdf_pdf: wp.array | None = None
+    roughness: wp.array | None = None
+    transmits: wp.array | None = None
     weight: wp.array | None = None
     survival: wp.array | None = None
     radiance: wp.array | None = None
@@ -249,6 +264,12 @@ def make_gather(fields: tuple[str, ...]):
                     out.pdf[index] = rows.pdf[entry]
                 if wp.static("guide_pdf" in fields):
                     out.guide_pdf[index] = rows.guide_pdf[entry]
+                if wp.static("bsdf_pdf" in fields):
+                    out.bsdf_pdf[index] = rows.bsdf_pdf[entry]
+                if wp.static("roughness" in fields):
+                    out.roughness[index] = rows.roughness[entry]
+                if wp.static("transmits" in fields):
+                    out.transmits[index] = rows.transmits[entry]
                 if wp.static("weight" in fields):
                     out.weight[index] = rows.weight[entry]
                 if wp.static("survival" in fields):

@@ -157,6 +157,7 @@ class Renderer:
         self.kernels = make_kernels(self.features)
         self.guide, self._guiding = guide, None
         if guide is not None:
+            guide.threads = threads
             self._guiding = Guiding(guide, scene, self.device_scene, self.features, self.device)
         self.statistics = Statistics()
         self._trace_worker: TraceWorker | None = None

@@ -57,10 +57,10 @@ class VmfMixture:
             derivatives with respect to the raw outputs to the flat array `gradient`, which must not overlap `raw`.
         product_log_pdf_gradient: (raw, offset, mu, kappa, w, factor, gradient, gradient_offset) -> log pdf; the same
             for the normalised product with one lobe.
-        kl_loss: A loss for `nn.Model` (see `nn.losses`). A row of its target is w and then the weight f(w) / q(w), f
-            being the function to learn, not negative, and q the density that w was drawn with; further columns are not
-            read. Its value, -weight · log pdf(w), has the mean F · (KL(f / F || pdf) + entropy of f / F), where F is
-            the integral of f. So its gradient is an estimate, by one sample, of F times that of the divergence.
+        kl_loss: A loss for `nn.Model` (see `nn.losses`). The four columns of its target are w and the weight
+            f(w) / q(w), f being the function to learn, not negative, and q the density that w was drawn with. Its
+            value, -weight · log pdf(w), has the mean F · (KL(f / F || pdf) + entropy of f / F), where F is the integral
+            of f. So its gradient is an estimate, by one sample, of F times that of the divergence.
     """
 
     n_lobes: int

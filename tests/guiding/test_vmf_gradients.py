@@ -236,7 +236,7 @@ def test_a_network_learns_a_target_by_this_loss(direction):
         seed=1,
     )
     ones = np.ones((1024, 1), np.float32)
-    target = np.zeros((1024, mixture.n_params), np.float32)
+    target = np.zeros((1024, 4), np.float32)
     divergences = []
     for step in range(250):
         if step in (0, 249):

@@ -341,7 +341,11 @@ def test_rows_of_an_earlier_batch_leave_no_trace():
 
 
 def power_loss(scale):
-    """A loss of one's own; all have one name."""
+    """A loss of one's own; all have one name, and differ by a constant here and in a function that they call."""
+
+    @wp.func
+    def term(d: wp.float32):
+        return scale * wp.abs(d) * d * d
 
     @wp.func
     def loss(
@@ -356,16 +360,17 @@ def power_loss(scale):
         total = wp.float32(0.0)
         for i in range(target.shape[1]):
             d = y[y_offset + i] - target[row, i]
-            total += scale * wp.abs(d) * d * d
+            total += term(d)
             dL_dy[dL_dy_offset + i] = scale * 3.0 * wp.abs(d) * d * factor
         return total
 
     return loss
 
 
-def test_own_loss():
-    """Losses of the caller's own run inside the training kernel."""
-    model = make(GRID)
+@pytest.mark.parametrize("execution", ["blocks", "tiles"])
+def test_own_loss(execution):
+    """Losses of the caller's own run inside the training kernel; those of one factory do not share one."""
+    model = make(GRID, execution=execution)
     x, target = inputs(200, 3), inputs(200, 4)
     y = model.inference(x)
     losses = {scale: power_loss(scale) for scale in (1.0, 2.0)}
@@ -378,6 +383,50 @@ def test_own_loss():
         model.forward(x)
         model.backward((scale * 3 * np.abs(y - target) * (y - target) / y.size).astype(np.float32))
         np.testing.assert_allclose(found, model.gradients.numpy(), atol=1e-6 * np.abs(found).max())
+
+
+@wp.func
+def weighted_loss(
+    y: wp.array[wp.float32],
+    y_offset: int,
+    target: wp.array2d[wp.float32],
+    row: int,
+    factor: wp.float32,
+    dL_dy: wp.array[wp.float32],
+    dL_dy_offset: int,
+):
+    """Of 18 outputs: the last column weighs the squares of their differences to the first, whatever is between."""
+    total = wp.float32(0.0)
+    weight = target[row, target.shape[1] - 1]
+    for i in range(18):
+        d = y[y_offset + i] - target[row, 0]
+        total += weight * d * d
+        dL_dy[dL_dy_offset + i] = weight * 2.0 * d * factor
+    return total
+
+
+@pytest.mark.parametrize("execution", ["blocks", "tiles"])
+@pytest.mark.parametrize("width", [1, 2, 23])
+def test_targets_of_an_own_loss_have_any_width(execution, width):
+    """Fewer and more columns than outputs, which fill two blocks of a tile network."""
+    network = {"output_activation": "Sigmoid"}
+    model = make(GRID, network, n_out=18, execution=execution)
+    x, target, outputs = inputs(77, 3), inputs(77, width, seed=2), np.full((77, 18), np.nan, np.float32)
+    value = model.compute_gradients(x, target, loss=weighted_loss, outputs=outputs)
+    found = model.gradients.numpy().copy()
+    y = model.inference(x)
+    np.testing.assert_allclose(outputs, y, atol=1e-6)
+    d, weight = y.astype(np.float64) - target[:, :1], target[:, -1:].astype(np.float64)
+    assert value == pytest.approx((weight * d**2).mean(), rel=1e-5)
+    model.zero_gradients()
+    model.forward(x)
+    model.backward((2 * weight * d / d.size).astype(np.float32))
+    np.testing.assert_allclose(found, model.gradients.numpy(), atol=2e-6 * np.abs(found).max())
+    assert model.train_step(x[:0], target[:0], loss=weighted_loss, report=False) is None
+    with pytest.raises(nn.NnError, match=rf"target: found shape \(77, {width}\); allowed: \[n, 18\]"):
+        model.train_step(x, target)
+    with pytest.raises(nn.NnError, match=r"target: found shape \(77, 0\); allowed: \[n, 1 or more\]"):
+        model.train_step(x, target[:, :0], loss=weighted_loss)
 
 
 def test_wrong_arrays_are_named():

@@ -36,6 +36,7 @@ class DeviceScene:
     sphere_count: int
     instanced_triangle_count: int  # as many as there would be without groups
     instance_count: int
+    bounds: np.ndarray  # of all surfaces, metres: [2, 3]; zeros without any
     light_count: int
     # What the kernels must know
     smooth: bool
@@ -98,6 +99,7 @@ class _Upload:
             instanced_triangle_count=parts[0].triangle_count
             + sum(parts[1 + i].triangle_count for i in self.instances.group_of),
             instance_count=len(self.instances.group_of),
+            bounds=bounds,
             light_count=lights.lights.shape[0],
             smooth=any(mesh.normals is not None for meshes, _ in collected for _, mesh, _ in meshes),
             bsdfs=tuple(sorted(self.materials.kinds)),

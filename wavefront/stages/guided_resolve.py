@@ -42,6 +42,7 @@ def make_guided_resolve(
         wi: wp.vec3,
         pdf: float,
         guide_pdf_at: float,
+        proposals: Proposals,
         weight: wp.vec3,
         survival: float,
     ):
@@ -64,6 +65,12 @@ def make_guided_resolve(
             rows.wi[entry] = wi
         if wp.static("guide_pdf" in records):
             rows.guide_pdf[entry] = guide_pdf_at
+        if wp.static("bsdf_pdf" in records):
+            rows.bsdf_pdf[entry] = proposals.bsdf_pdf[slot]
+        if wp.static("roughness" in records):
+            rows.roughness[entry] = proposals.roughness[slot]
+        if wp.static("transmits" in records):
+            rows.transmits[entry] = proposals.transmits[slot]
 
     @wp.kernel(enable_backward=False, module="unique")
     def resolve_directions(
@@ -130,7 +137,9 @@ def make_guided_resolve(
             row = record_row(rows, tile, slot)
             if row >= 0:
                 wo = -paths.direction[slot]
-                record_scattering(rows, row, depth, surfaces, slot, wo, wi, pdf, guide_pdf_at, weight, survival)
+                record_scattering(
+                    rows, row, depth, surfaces, slot, wo, wi, pdf, guide_pdf_at, proposals, weight, survival
+                )
         paths.beta[slot] = beta
         paths.direction[slot] = wi
         paths.pdf[slot] = pdf

@@ -1,4 +1,5 @@
-"""Guided vertices: queues the vertices where a guide has a say, with the share of BSDF sampling there."""
+"""Guided vertices: queues the vertices where a guide has a say, with the share of BSDF sampling and what
+the guide asks to know of the surface there."""
 
 from __future__ import annotations
 
@@ -7,7 +8,8 @@ import functools
 import warp as wp
 
 from wavefront.bsdf.delta import make_delta_probability
-from wavefront.bsdf.dispatch import is_smooth
+from wavefront.bsdf.dispatch import is_smooth, side_kind, transmits
+from wavefront.bsdf.roughness import make_roughness
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.proposals import Proposals
 from wavefront.queues import Paths, Queue, Surfaces, push, queue_size
@@ -15,9 +17,17 @@ from wavefront.texture import TextureTables
 
 
 @functools.cache
-def make_guided_vertices(bsdfs: tuple[str, ...], mask: bool, textures: tuple[str, ...], uvs: bool, mixed_deltas: bool):
+def make_guided_vertices(
+    bsdfs: tuple[str, ...],
+    mask: bool,
+    textures: tuple[str, ...],
+    uvs: bool,
+    mixed_deltas: bool,
+    guide_inputs: tuple[str, ...],
+):
     """Kernel of the stage; the arguments are the fields and properties of `Features` of the same name."""
     delta_probability = make_delta_probability(bsdfs, mask, textures)
+    roughness_at = make_roughness(bsdfs, textures)
 
     @wp.kernel(enable_backward=False, module="unique")
     def queue_guided_vertices(
@@ -40,16 +50,22 @@ def make_guided_vertices(bsdfs: tuple[str, ...], mask: bool, textures: tuple[str
         normal = surfaces.shading_normal[slot]
         wo = -paths.direction[slot]
         delta = float(0.0)
-        smooth = is_smooth(materials.materials[material], wp.dot(normal, wo))
+        cos_o = wp.dot(normal, wo)
+        smooth = is_smooth(materials.materials[material], cos_o)
+        uv = wp.vec2(0.0)
+        if wp.static(uvs):
+            uv = surfaces.uv[slot]
         if wp.static(mixed_deltas):
             if smooth:
-                uv = wp.vec2(0.0)
-                if wp.static(uvs):
-                    uv = surfaces.uv[slot]
                 delta = delta_probability(materials, textures, material, uv, normal, wo)
                 smooth = delta < 1.0
             proposals.delta[slot] = delta
         proposals.share[slot] = wp.where(smooth, share, 1.0)
+        if wp.static("roughness" in guide_inputs):
+            proposals.roughness[slot] = roughness_at(materials, textures, material, uv, cos_o)
+        if wp.static("transmits" in guide_inputs):
+            through = transmits(side_kind(materials.materials[material], cos_o))
+            proposals.transmits[slot] = wp.where(through, 1, 0)
         if smooth:  # a BSDF of deltas alone needs no guide
             push(guided, slot, counters)
 
