@@ -7,6 +7,7 @@ import json
 import os
 import platform
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
@@ -16,6 +17,7 @@ import warp as wp
 import wavefront
 from wavefront.errors import WavefrontError
 from wavefront.film import INTEGERS, Film, row_blocks
+from wavefront.guide import Guide
 from wavefront.identity import scene_hash
 from wavefront.renderer import Renderer, peak_memory_bytes
 from wavefront.scene import description
@@ -60,8 +62,8 @@ def check_writable(path: Path) -> None:
         raise WavefrontError(f"{path}: cannot be written: {error.strerror or error}") from None
 
 
-def check_not_read(exr: Path, source: str | os.PathLike, scene: description.Scene) -> None:
-    """Refuses an output that would replace the scene file, or an image or mesh of the scene.
+def check_not_read(paths: Sequence[Path], source: str | os.PathLike, scene: description.Scene) -> None:
+    """Refuses files to write that would replace the scene file, or an image or mesh of the scene.
 
     Raises:
         WavefrontError: Names the file.
@@ -69,7 +71,7 @@ def check_not_read(exr: Path, source: str | os.PathLike, scene: description.Scen
     read = {os.path.realpath(source)} | {
         os.path.realpath(record.file) for _, record in walk(scene) if getattr(record, "file", None)
     }
-    for path in output_paths(exr):
+    for path in paths:
         if os.path.realpath(path) in read:
             raise WavefrontError(
                 f"{path}: would be overwritten, but the scene is read from it; choose another name with -o"
@@ -159,7 +161,12 @@ def describe_render(renderer: Renderer, source: str, started: float, preset: dic
         "bytes_per_path": renderer.bytes_per_path,
         "paths_in_flight": renderer.capacity * renderer.threads,
         "warnings": renderer.warnings,
-    } | ({"guide": {"name": renderer.guide.name} | renderer.guide.statistics()} if renderer.guide else {})
+    } | ({"guide": describe_guide(renderer.guide)} if renderer.guide else {})
+
+
+def describe_guide(guide: Guide) -> dict:
+    """The account of a guide: ``method``, ``settings`` and ``statistics``."""
+    return {"method": guide.name, "settings": guide.identity(), "statistics": guide.statistics()}
 
 
 def write_film(exr: Path, renderer: Renderer, half: bool) -> None:

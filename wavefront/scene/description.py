@@ -682,7 +682,7 @@ class GuideChoice(Record):
     ] = None
     bsdf_share: Annotated[
         Annotated[float, Meta(gt=0.0, le=1.0)] | None,
-        Meta(description="Probability of BSDF sampling where the guide does not say another; null: that of the preset."),
+        Meta(description="Probability of BSDF sampling, where the guide says no other; null: that of the preset."),
     ] = None
     settings: Annotated[
         dict[str, Any], Meta(description="Further settings of the method, by name, in place of those of the preset.")
