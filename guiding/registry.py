@@ -115,7 +115,7 @@ def make_guide(preset: str, settings: Mapping[str, Any] | None = None, where: st
     return getattr(importlib.import_module(module), guide)(values, seed=seed)
 
 
-def choice_of(scene: description.Scene) -> tuple[str, dict[str, Any]] | None:
+def _choice(scene: description.Scene) -> tuple[str, dict[str, Any]] | None:
     """The preset that a scene names and all changes of its settings; None for a scene without a guide."""
     choice = scene.integrator.guide
     if choice is None:
@@ -125,11 +125,24 @@ def choice_of(scene: description.Scene) -> tuple[str, dict[str, Any]] | None:
     return choice.preset, {k: v for k, v in choice.settings.items() if k.rpartition(".")[2] not in given} | given
 
 
+def plain_settings(scene: description.Scene) -> dict[str, Any] | None:
+    """The guide that a scene names as plain values: ``method``, and ``settings``, all of them; None if it names none.
+
+    Raises:
+        SceneError: As of `make_guide`.
+    """
+    choice = _choice(scene)
+    if choice is None:
+        return None
+    method, settings = guide_settings(*choice)
+    return {"method": method, "settings": msgspec.to_builtins(settings)}
+
+
 def guide_of(scene: description.Scene, seed: int = 0) -> Guide | None:
     """The guide that a scene names, for ``Renderer(scene, guide=guide_of(scene))``; None if it names none.
 
     Raises:
         SceneError: As of `make_guide`.
     """
-    choice = choice_of(scene)
+    choice = _choice(scene)
     return None if choice is None else make_guide(*choice, seed=seed)

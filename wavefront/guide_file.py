@@ -13,8 +13,8 @@ from wavefront.checkpoint import read_checkpoint, write_checkpoint
 from wavefront.guide import Guide
 
 KIND = "guide file"
-# Settings of how long a guide learns and how much it is trusted. What it has learned fits whatever they are.
-OF_USE = ("train_share", "bsdf_share")
+# Settings of how a guide begins, how long it learns and how much it is trusted: what it has learned fits others too.
+OF_USE = ("seed", "train_share", "bsdf_share")
 
 
 def guide_identity(guide: Guide) -> dict:

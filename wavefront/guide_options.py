@@ -72,6 +72,8 @@ def make_guide(scene: Scene, arguments: argparse.Namespace) -> Guide | None:
             del choice.settings[other]
         choice.settings[key] = _value(value)
         written[f"integrator.guide.settings.{key}"] = f"--guide-set {text}"
+    if arguments.guide is not None:
+        written["integrator.guide.preset"] = f"--guide {arguments.guide}"
     from guiding import guide_of
 
     try:
