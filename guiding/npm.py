@@ -3,8 +3,8 @@
 Dong, Wang and Li, "Neural Parametric Mixtures for Path Guiding", SIGGRAPH 2023. A vertex x (with wo, the normal n and
 the roughness in the product variant) is encoded by a dense multiresolution grid, spherical harmonics and one-blobs; a
 small network turns that into the raw parameters of a mixture v(w). Training minimises KL(target || v) by its gradient
-from one sample per record (their equation 10): -(target / p) grad log v, with p the density that the direction was drawn
-with. Targets are, of the mean of the colour channels,
+from one sample per record (their equation 10): -(target / p) grad log v, with p the density that the direction was
+drawn with. Targets are, of the mean of the colour channels,
 
     radiance   Li(x, w)
     product    f(x, wo, w) Li(x, w)
@@ -303,10 +303,11 @@ class NpmGuide(Guide):
             device=self.device,
         )
         raw = self.model.inference(x).flatten()
-        axis = npm_kernels.cosine_axis(normal, wo, through)
         w = wp.array(np.asarray(directions, np.float32), dtype=wp.vec3, device=self.device)
         pdfs = wp.empty(w.shape[0], dtype=wp.float32, device=self.device)
-        wp.launch(evaluate_query, dim=w.shape[0], inputs=[raw, axis, w], outputs=[pdfs], device=self.device)
+        wp.launch(
+            evaluate_query, dim=w.shape[0], inputs=[raw, normal, wo, through, w], outputs=[pdfs], device=self.device
+        )
         return pdfs.numpy()
 
 

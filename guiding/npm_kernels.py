@@ -1,7 +1,5 @@
 """Kernels and loss of neural parametric mixtures: see `guiding.npm`."""
 
-from __future__ import annotations
-
 import functools
 import math
 
@@ -322,13 +320,16 @@ def make_query(product: bool, cosine_aware: bool, mixture: VmfMixture):
     @wp.kernel(enable_backward=False, module="unique")
     def evaluate_query(
         raw: wp.array[wp.float32],
-        axis: wp.vec3,
+        normal: wp.vec3,
+        wo: wp.vec3,
+        through: int,
         directions: wp.array[wp.vec3],
         # out
         pdfs: wp.array[wp.float32],
     ):
         m = decode(raw, 0)
         if wp.static(cosine_aware):
+            axis = cosine_axis(normal, wo, through)
             kappa = cosine_kappa(axis)
             if kappa > 0.0:
                 m = multiply(m, axis, kappa)

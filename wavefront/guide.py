@@ -81,8 +81,8 @@ class GuideContext:
         seed: Of the random numbers.
         paths: State of the paths, by slot; `direction` is that of the ray which arrived, `-wo`. To be read only.
         surfaces: The vertices, by slot; `shading_normal` is that of the BSDF. To be read only.
-        proposals: By slot, with the `inputs` that the guide asked for. A guide may write `share` in `prepare`, `wi` and, without a density, `guide_pdf` in
-            `propose`; no more.
+        proposals: By slot, with the `inputs` that the guide asked for. A guide may write `share` in `prepare`, `wi`
+            and, without a density, `guide_pdf` in `propose`; no more.
         counters: `counters[wavefront.queues.DEPTH]` is the number of scatterings so far.
     """
 

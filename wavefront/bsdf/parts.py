@@ -14,8 +14,8 @@ from wavefront.texture import TextureTables
 
 @functools.cache
 def make_sum_over_parts(of_kind: wp.Function, kinds: tuple[str, ...], textures: tuple[str, ...]):
-    """`sum_over_parts(tables, textures, material_index, uv, cos_o) -> vec2`: of a function of the BSDFs on the side of a
-    material that is seen, by their weights in its blend; of one BSDF, the function itself.
+    """`sum_over_parts(tables, textures, material_index, uv, cos_o) -> vec2`: of a function of the BSDFs on the side of
+    a material that is seen, by their weights in its blend; of one BSDF, the function itself.
 
     Args:
         of_kind: (tables, textures, kind, index, uv, cos_o) -> vec2. The cosine is negative only behind a BSDF that
