@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 import wavefront
-from guiding import make_guide
+from guiding import make_guide, registry
 from tests.guides import ChosenMeanGuide, use_mean_preset
 from wavefront import Renderer, load_scene, render
 from wavefront.checkpoint import write_checkpoint
@@ -24,6 +24,7 @@ from wavefront.guide_file import KIND, guide_identity, load_guide, save_guide
 from wavefront.scene import description, json_format
 
 SIZE, SPP = 12, 8
+FOLDER = registry.FOLDER
 SCENE = {
     "camera": {"type": "perspective", "fov": 60, "to_world": [{"translate": [0, 0, 3]}]},
     "film": {"width": SIZE, "height": SIZE},
@@ -226,6 +227,28 @@ def test_a_loaded_guide_is_used_from_the_first_pass(capsys):
     assert more > learned
     load_guide(same.guide, "a.guide")
     assert same.guide.statistics()["records"] == more
+
+
+def test_networks_are_kept_whole(tmp_path, monkeypatch):
+    """Parameters, averages, and the state of the optimiser: learning goes on as it would have."""
+    small = {"n_lobes": 2, "n_levels": 2, "n_features": 1, "n_neurons": 16, "train_share": 1.0}
+    monkeypatch.setattr(registry, "FOLDER", FOLDER)
+    first, second = (
+        Renderer(load_scene("plain-scene.json"), threads=1, guide=make_guide("npm-radiance", small, seed=seed))
+        for seed in (1, 2)
+    )
+    first.render(3)
+    save_guide(first.guide, tmp_path / "a.guide")
+    load_guide(second.guide, tmp_path / "a.guide")
+    save_guide(second.guide, tmp_path / "b.guide")
+    first.render(2)
+    second.film.sample_count = 3  # the same samples as the first one
+    second.render(2)
+    for name, array in first.guide.arrays().items():
+        np.testing.assert_array_equal(second.guide.arrays()[name].numpy(), array.numpy(), err_msg=name)
+    assert second.guide.statistics() == first.guide.statistics()
+    load_guide(first.guide, tmp_path / "b.guide")
+    assert first.guide.statistics()["training_passes"] == 3
 
 
 def test_a_guide_file_is_an_npz(capsys):
