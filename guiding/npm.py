@@ -27,7 +27,7 @@ import warp as wp
 from guiding import npm_kernels
 from guiding.distributions.vmf_mixture import DIRECTIONS, make_vmf_mixture
 from nn import Model
-from wavefront.guide import Guide, GuideContext, GuideState, GuideVertex
+from wavefront.guide import MIN_SAMPLE_WEIGHT, Guide, GuideContext, GuideState, GuideVertex
 from wavefront.queues import Queue
 from wavefront.recording import RecordArrays, RecordRequest, Records
 
@@ -35,8 +35,6 @@ Fraction = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 Decay = Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0.0)]
-
-_FIRST_WEIGHT = 1e-3  # of the first frame, whose rule says zero; a film of that frame alone shall be an image
 
 
 class NpmSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -230,7 +228,7 @@ class NpmGuide(Guide):
         share = self.settings.train_share
         if not self.settings.sample_weighting or progress >= share:
             return 1.0
-        return max(progress / share, _FIRST_WEIGHT)
+        return max(progress / share, MIN_SAMPLE_WEIGHT)
 
     def train(self, records: Records):
         s, n = self.settings, records.count

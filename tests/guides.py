@@ -2,7 +2,8 @@
 
 `HistogramGuide` needs two rounds: the second coordinate of a direction has a distribution that depends on the first.
 `ResamplingGuide` has no density. `LobeGuide` is a closed form. `MeanGuide` learns a number, to see that it is kept;
-`ChosenMeanGuide` is the same as a method that presets choose.
+`ChosenMeanGuide` is the same as a method that presets choose. `RampGuide` gives little weight to what it does before
+it has learned.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from guiding import registry
 from wavefront.bsdf.dispatch import make_bsdf
 from wavefront.bsdf.frame import make_frame
 from wavefront.bsdf.tables import MaterialTables
-from wavefront.guide import Guide, GuideContext, GuideState
+from wavefront.guide import MIN_SAMPLE_WEIGHT, Guide, GuideContext, GuideState
 from wavefront.proposals import INPUTS, Proposals
 from wavefront.queues import DEPTH, Paths, Queue, Surfaces, queue_size
 from wavefront.recording import FIELDS, RecordRequest, Records
@@ -507,3 +508,19 @@ def use_mean_preset(monkeypatch, folder) -> None:
     (folder / "mean.json").write_text(json.dumps(MEAN_PRESET))
     monkeypatch.setattr(registry, "FOLDER", folder)
     monkeypatch.setitem(registry.METHODS, "mean", ("tests.guides", "MeanSettings", "ChosenMeanGuide"))
+
+
+class RampGuide(MeanGuide):
+    """One that learns, with sample weights that grow with the progress: 1 from `full` on."""
+
+    name, weighted = "ramp", True
+
+    def __init__(self, train_share: float = 0.5, full: float = 0.75, **settings):
+        super().__init__(train_share, **settings)
+        self.full = full
+
+    def sample_weight(self, progress):
+        return min(max(progress / self.full, MIN_SAMPLE_WEIGHT), 1.0)
+
+    def identity(self):
+        return super().identity() | {"full": self.full}

@@ -161,10 +161,14 @@ def test_row_blocks_cover_an_image_once(width, height):
     assert max(last - first for first, last in blocks) * width <= 1 << 17
 
 
+@pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("aovs", [(), ("variance",), ("sample_count",), ("shape_index", "bsdf_index"), tuple(ALL)])
-def test_bytes_per_pixel_are_what_is_allocated(aovs):
-    film = Film(100, 10, aovs, "cpu", [0])
+def test_bytes_per_pixel_are_what_is_allocated(aovs, weighted):
+    film = Film(100, 10, aovs, "cpu", [0], weighted)
     arrays = [getattr(film.arrays, name) for name in FilmArrays.vars]
-    assert sum(array.capacity for array in arrays if array is not None) == 1000 * Film.bytes_per_pixel(aovs)
+    allocated = sum(array.capacity for array in arrays if array is not None)
+    assert allocated == 1000 * Film.bytes_per_pixel(aovs, weighted) + 4 * 8 * weighted
+    more = 8 if weighted and "variance" in aovs else 0
+    assert Film.bytes_per_pixel(aovs, weighted) == Film.bytes_per_pixel(aovs) + more
     assert Film.bytes_per_pixel(("sample_count",)) == Film.bytes_per_pixel(()) == 24
     assert Film.bytes_per_pixel(("shape_index", "bsdf_index")) == 28

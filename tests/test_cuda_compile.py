@@ -128,6 +128,7 @@ def guided_modules(features: Features) -> list:
             guided = dataclasses.replace(features, guide=("any",), guide_pdf=guide_pdf, records=records)
             kernels += [*make_guided_kernels(guided).values(), make_kernels(guided).advance]
     kernels += make_gather(tuple(FIELDS))
+    kernels.append(make_kernels(dataclasses.replace(guided, variance=True, weighted=True)).accumulate)
     return list(dict.fromkeys(kernel.module for kernel in kernels))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from tests.guides import HistogramGuide, LobeGuide, MeanGuide, ResamplingGuide
+from tests.guides import HistogramGuide, LobeGuide, MeanGuide, RampGuide, ResamplingGuide
 from tools.image_test import Comparison, Estimate
 from wavefront import Renderer, WavefrontError, load_scene, renderer
 from wavefront.checkpoint import CheckpointError
@@ -104,6 +104,11 @@ def test_a_guide_that_learns_is_unbiased(nee):
     check_unbiased("cornell-box", nee, MeanGuide(0.2, one_minus_cos=0.3))
 
 
+@pytest.mark.parametrize("nee", ["true", "false"])
+def test_weights_of_samples_leave_it_unbiased(nee):
+    check_unbiased("cornell-box", nee, RampGuide(0.2, 0.5, one_minus_cos=0.3))
+
+
 # --- the BSDF alone --------------------------------------------------------------------------------------------------
 
 
@@ -175,12 +180,13 @@ def test_bytes_per_path_are_what_is_allocated(guide, nee):
 # --- deterministic ---------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module", params=["histogram", "resampling", "mean"])
+@pytest.fixture(scope="module", params=["histogram", "resampling", "mean", "ramp"])
 def make_guide(request):
     return {
         "histogram": HistogramGuide,
         "resampling": lambda: ResamplingGuide(2, from_bsdf=True),
         "mean": lambda: MeanGuide(0.5, one_minus_cos=0.5),
+        "ramp": lambda: RampGuide(0.5, one_minus_cos=0.5),
     }[request.param]
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
+from tests.guides import MeanGuide, RampGuide
 from tools.merge import combine, main
 from wavefront import Renderer, load_scene
 from wavefront.film import LUMINANCE
@@ -122,6 +123,38 @@ def test_merges_of_merges(renders, tmp_path):
     channels, header = merged(tmp_path / "all.exr", tmp_path / "pair.exr", *paths(folder, 12))
     assert_joint(channels, films, roundings=3)
     assert (header["samplesPerPixel"], header["seed"]) == (12, "11,13,12")
+
+
+def test_samples_with_weights(tmp_path, capsys):
+    """Radiance by the sums of weights, all else by the number of samples, the variance of independent images."""
+    films, files = [], []
+    for seed, spp, guide in ((1, 4, RampGuide), (2, 7, RampGuide), (3, 2, MeanGuide)):
+        r = Renderer(load(), seed=seed, threads=1, guide=guide())
+        r.render(spp)
+        films.append(r.film)
+        files.append(tmp_path / f"{seed}.exr")
+        write_exr(files[-1], r.film.channels(), attributes=image_attributes(r))
+    weights = [film.weight_sums[0] for film in films]
+    assert weights[2] == 2.0 and weights[0] < 3.0
+    channels, header = merged(tmp_path / "out.exr", *files)
+    assert float(header["sumOfWeights"]) == sum(weights) and header["samplesPerPixel"] == 13
+    L = sum(film.arrays.L.numpy() for film in films) / sum(weights)
+    np.testing.assert_allclose(np.stack([channels[c].ravel() for c in "RGB"], axis=1), L, rtol=3e-7)
+    depth = sum(film.arrays.depth.numpy() for film in films) / 13
+    np.testing.assert_allclose(channels["depth.Z"].ravel(), depth, rtol=3e-7)
+    squares = sum((w * w * film.variance().astype(np.float64)) for w, film in zip(weights, films, strict=True))
+    np.testing.assert_allclose(channels["variance.Y"], squares / sum(weights) ** 2, rtol=3e-7)
+    assert (channels["variance.Y"] > 0.0).mean() > 0.5
+
+    merged(tmp_path / "pair.exr", *files[::2])
+    again, _ = merged(tmp_path / "again.exr", tmp_path / "pair.exr", files[1])
+    assert again.keys() == channels.keys()
+    for name in again:
+        np.testing.assert_allclose(again[name], channels[name], rtol=1e-6, atol=1e-7, err_msg=name)
+    capsys.readouterr()
+    for text, message in (("x", "header is damaged"), ("4.5", "a sum of weights of 4.5; allowed"), ("nan", "of nan")):
+        write_exr(tmp_path / "bad.exr", channels, attributes=image_attributes(r) | {"sumOfWeights": text})
+        assert message in refused(capsys, tmp_path, files[0], tmp_path / "bad.exr", "-o", tmp_path / "none.exr")
 
 
 def test_rows_in_blocks(renders, tmp_path, monkeypatch):

@@ -2,6 +2,7 @@
 
 The result is the image of all their samples together: means are weighted by the number of samples, the variance of the
 mean is that of the joint sample, sample counts add up, and indices of shapes and BSDFs are those of the first image.
+Where a guide gave weights to samples, radiance is weighted by their sums, and the variance is that of such a mean.
 Machines that share nothing but a folder render one image in this way, each with its own ``--seed``.
 """
 
@@ -38,6 +39,7 @@ class Render:
     path: Path
     image: oiio.ImageInput
     samples: int
+    weight: float | None  # sum over the samples of a pixel; None if they have no weights
     seeds: list[int]
     scene_hash: str
     settings: dict
@@ -69,15 +71,20 @@ def open_render(path: Path) -> Render:
     try:
         samples, seeds = int(found["samplesPerPixel"]), [int(seed) for seed in found["seed"].split(",")]
         settings = json.loads(found["settings"])
-        render = Render(path, image, samples, seeds, found["sceneHash"], settings, found["renderer"])
+        weight = float(found["sumOfWeights"]) if "sumOfWeights" in found else None
+        render = Render(path, image, samples, weight, seeds, found["sceneHash"], settings, found["renderer"])
     except KeyError as error:
         raise WavefrontError(
             f"{path}: its header has no {error.args[0]!r}; allowed: images of wavefront.render"
         ) from None
     except (ValueError, AttributeError):
-        raise WavefrontError(f"{path}: its header is damaged: samplesPerPixel, seed or settings") from None
+        raise WavefrontError(
+            f"{path}: its header is damaged: samplesPerPixel, sumOfWeights, seed or settings"
+        ) from None
     if samples < 1:
         raise WavefrontError(f"{path}: an image of {samples} samples per pixel; allowed: 1 or more")
+    if weight is not None and not 0.0 < weight <= samples:
+        raise WavefrontError(f"{path}: a sum of weights of {weight:g}; allowed: more than 0, up to one per sample")
     return render
 
 
@@ -107,29 +114,43 @@ def check_alike(renders: Sequence[Render]) -> None:
             taken[seed] = render.path
 
 
-def combine(blocks: Sequence[np.ndarray], samples: Sequence[int], channels: Sequence[str]) -> np.ndarray:
+def combine(
+    blocks: Sequence[np.ndarray],
+    samples: Sequence[int],
+    channels: Sequence[str],
+    weights: Sequence[float] | None = None,
+) -> np.ndarray:
     """Pixels of the joint sample.
 
     Of n_i samples with mean m_i, the variance v_i of the mean gives the sum of squares about it, n_i (n_i - 1) v_i.
     About the joint mean m of N samples it is larger by n_i (m_i - m)^2, and the variance of m is the sum of all these
     over N (N - 1): the same as if the samples had been taken at once (Chan, Golub and LeVeque 1983).
 
+    The squares of samples with weights cannot be had from v_i. Then the joint mean is sum(W_i m_i) / sum(W_i) with the
+    sums of weights W_i, and its variance sum(W_i^2 v_i) / sum(W_i)^2, because images are independent of each other; it
+    is not a number where one of them has a single sample.
+
     Args:
         blocks: Pixels of each image, shape [..., C], float32.
         samples: Of each image, per pixel.
         channels: C names.
+        weights: Sums over the samples of a pixel, of each image; None if samples have no weights.
 
     Returns:
         Float32, shape [..., C].
     """
     total = sum(samples)
     mean = sum(n * block.astype(np.float64) for n, block in zip(samples, blocks, strict=True)) / total
+    shares = None if weights is None else np.asarray(weights) / sum(weights)
     for c, name in enumerate(channels):
         kind = name.split(".")[0].replace("_", "").lower()
         if kind in INDICES:
             mean[..., c] = blocks[0][..., c]
         elif kind in COUNTS:
             mean[..., c] = sum(block[..., c].astype(np.float64) for block in blocks)
+        elif shares is not None and name in ("R", "G", "B", VARIANCE):
+            powers = shares**2 if name == VARIANCE else shares
+            mean[..., c] = sum(p * block[..., c].astype(np.float64) for p, block in zip(powers, blocks, strict=True))
         elif name == VARIANCE:
             rgb = [channels.index(colour) for colour in "RGB"]
             y = mean[..., rgb] @ np.asarray(LUMINANCE)
@@ -166,9 +187,14 @@ def merge(paths: Sequence[str | os.PathLike], out: str | os.PathLike) -> int:
     renders = [open_render(Path(path)) for path in paths]
     check_alike(renders)
     samples, channels = [render.samples for render in renders], renders[0].channels
+    weights = None
+    if any(render.weight is not None for render in renders):  # a sample without has 1
+        weights = [render.samples if render.weight is None else render.weight for render in renders]
     spec = oiio.ImageSpec(renders[0].image.spec())
     spec.set_format(oiio.FLOAT)
     spec.attribute("samplesPerPixel", sum(samples))
+    if weights is not None:
+        spec.attribute("sumOfWeights", repr(float(sum(weights))))
     spec.attribute("seed", ",".join(str(seed) for render in renders for seed in render.seeds))
     spec.attribute("renderer", ", ".join(dict.fromkeys(render.renderer for render in renders)))
     rows = max(16, BLOCK_VALUES // (spec.width * len(channels)) // 16 * 16)  # whole chunks of the ZIP compression
@@ -178,7 +204,7 @@ def merge(paths: Sequence[str | os.PathLike], out: str | os.PathLike) -> int:
         for y in range(spec.y, spec.y + spec.height, rows):
             end = min(y + rows, spec.y + spec.height)
             blocks = [_read_rows(render, y, end, len(channels)) for render in renders]
-            done = done and output.write_scanlines(y, end, 0, combine(blocks, samples, channels))
+            done = done and output.write_scanlines(y, end, 0, combine(blocks, samples, channels, weights))
         if not (output.close() and done):
             raise OSError(" ".join(output.geterror().split()))
     return sum(samples)

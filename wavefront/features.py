@@ -46,6 +46,7 @@ class Features:
     guide_pdf: bool = True  # the guide has a density
     guide_inputs: tuple[str, ...] = ()  # what the guide asks to know of surfaces, see `wavefront.proposals`
     records: tuple[str, ...] = ()  # fields of the records that the guide trains with; empty if it asks for none
+    weighted: bool = False  # samples have weights of the guide
 
     @property
     def guided(self) -> bool:

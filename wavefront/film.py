@@ -28,10 +28,17 @@ BLOCK_PIXELS = 1 << 17  # of a film that is turned into an image block by block
 
 @wp.struct
 class FilmArrays:
-    """Sums over the samples of each pixel, row by row; only what is asked for is allocated."""
+    """Sums over the samples of each pixel, row by row; only what is asked for is allocated.
+
+    In a film with weights w of samples, `L` has the sum of w L, and `luminance_squared` that of (w Y)^2 with the
+    luminance Y. AOVs of the first hit are summed as ever: a guide, for whose sake there are weights, does not change
+    what a camera ray hits.
+    """
 
     L: wp.array[wp.vec3d]
     luminance_squared: wp.array[wp.float64]
+    weighted_luminance: wp.array[wp.float64]  # the sum of w^2 Y
+    weights: wp.array[wp.float64]  # w of the samples that are being added; sums over all so far of w, w^2 and w^3
     albedo: wp.array[wp.vec3d]
     normal: wp.array[wp.vec3d]
     geometric_normal: wp.array[wp.vec3d]
@@ -73,9 +80,10 @@ def make_window(film: description.Film) -> FilmWindow:
     return window
 
 
-def film_arrays(aovs: tuple[str, ...]) -> tuple[str, ...]:
-    """Arrays, beside that of the radiance, that some AOVs need, sorted."""
-    return tuple(sorted({_ARRAYS[aov] for aov in aovs if aov in _ARRAYS}))
+def film_arrays(aovs: tuple[str, ...], weighted: bool = False) -> tuple[str, ...]:
+    """Arrays with an entry per pixel, beside that of the radiance, that some AOVs need, sorted."""
+    needed = {_ARRAYS[aov] for aov in aovs if aov in _ARRAYS}
+    return tuple(sorted(needed | ({"weighted_luminance"} if weighted and "variance" in aovs else set())))
 
 
 def row_blocks(width: int, height: int) -> Iterator[tuple[int, int]]:
@@ -94,6 +102,7 @@ class Film:
         aovs: Subset of the keys of `CHANNELS`.
         device: Warp device.
         bsdf_of_shape: Index of the BSDF of each shape; needed for ``bsdf_index``.
+        weighted: Samples have weights. Then `begin_pass` tells that of each pass.
     """
 
     def __init__(
@@ -103,20 +112,48 @@ class Film:
         aovs: tuple[str, ...],
         device: str,
         bsdf_of_shape: Sequence[int] = (),
+        weighted: bool = False,
     ):
-        self.width, self.height, self.aovs = width, height, aovs
+        self.width, self.height, self.aovs, self.weighted = width, height, aovs, weighted
         self.bsdf_of_shape = bsdf_of_shape
         self.sample_count = 0
         self.arrays = FilmArrays()
-        for name in ("L", *film_arrays(aovs)):
+        for name in ("L", *film_arrays(aovs, weighted)):
             dtype = FilmArrays.vars[name].type.dtype
             setattr(self.arrays, name, wp.zeros(width * height, dtype=dtype, device=device))
+        if weighted:
+            self.arrays.weights = wp.zeros(4, dtype=wp.float64, device=device)
 
     @staticmethod
-    def bytes_per_pixel(aovs: tuple[str, ...]) -> int:
+    def bytes_per_pixel(aovs: tuple[str, ...], weighted: bool = False) -> int:
         """Memory that one pixel of the film takes."""
-        dtypes = (FilmArrays.vars[name].type.dtype for name in ("L", *film_arrays(aovs)))
+        dtypes = (FilmArrays.vars[name].type.dtype for name in ("L", *film_arrays(aovs, weighted)))
         return sum(wp.types.type_size_in_bytes(dtype) for dtype in dtypes)
+
+    def begin_pass(self, weight: float) -> None:
+        """Sets the weight of the samples that are added next, in a film with weights."""
+        self.arrays.weights[:1].fill_(weight)
+
+    def end_pass(self, samples: int) -> None:
+        """Counts samples that were added to every pixel."""
+        self.sample_count += samples
+        if self.weighted:
+            weights = self.arrays.weights.numpy().copy()
+            weights[1:] += samples * weights[0] ** np.arange(1, 4)
+            self.arrays.weights.assign(weights)
+
+    @property
+    def weight_sums(self) -> tuple[float, float, float]:
+        """Sums over the samples of a pixel of their weights, and of the second and third powers of these."""
+        if not self.weighted:
+            return (float(self.sample_count),) * 3
+        return tuple(self.arrays.weights.numpy()[1:].tolist())
+
+    @property
+    def effective_samples(self) -> float:
+        """Samples of equal weight, of the same variance as these, whose mean is as sure (Kish 1965); 0 for none."""
+        total, squares, _ = self.weight_sums
+        return total * total / squares if squares else 0.0
 
     def _rows(self, name: str, first: int, last: int) -> np.ndarray:
         """Rows of an array, on the host: [rows, width] or [rows, width, components]."""
@@ -124,7 +161,8 @@ class Film:
         return values.reshape(last - first, self.width, *values.shape[1:])
 
     def _mean(self, name: str, first: int, last: int) -> np.ndarray:
-        return self._rows(name, first, last) / max(self.sample_count, 1)
+        total = self.weight_sums[0] if name == "L" else self.sample_count
+        return self._rows(name, first, last) / (total if self.sample_count else 1)
 
     def _whole(self, rows) -> np.ndarray:
         """An image from the function that gives its rows, without copies of the whole film in between."""
@@ -141,7 +179,7 @@ class Film:
         return self._mean("L", first, last).astype(np.float32)
 
     def image(self) -> np.ndarray:
-        """Mean radiance, shape [height, width, 3], float32, linear Rec. 709."""
+        """Mean radiance, by the weights of the samples, shape [height, width, 3], float32, linear Rec. 709."""
         return self._whole(self.image_rows)
 
     def variance(self) -> np.ndarray:
@@ -149,6 +187,16 @@ class Film:
 
         Sample variance over n, from the sums of y and y^2 in float64, which leaves some nine digits after the
         subtraction for a pixel whose samples differ by one part in a thousand.
+
+        With weights, whose sums of powers are S1, S2 and S3, the mean m = sum(w y) / S1 has the variance
+        sum(w^2 var y) / S1^2, where samples may differ in their variances: those of a guide that has learned are
+        smaller. With y_i - m for what is not known, E[(y_i - m)^2] = (1 - 2 w_i / S1) var y_i + var m. So
+
+            var m ~ sum(w^2 (y - m)^2) / (S1^2 - 2 S1 S3 / S2 + S2)
+
+        is without bias if samples do not differ, whatever their weights, and is sample variance over n if weights do
+        not either. If they do differ, its relative bias is 2 (S3 / S2 - sum(w^3 var y) / sum(w^2 var y)) / S1 to first
+        order: of the order of 1 / n, and towards caution where a larger weight goes with a smaller variance.
         """
         return self._whole(self._variance)
 
@@ -157,7 +205,12 @@ class Film:
         mean = self._mean("L", first, last) @ np.asarray(LUMINANCE)
         if n < 2:
             return np.full(mean.shape, np.nan)
-        return np.maximum(self._mean("luminance_squared", first, last) - mean * mean, 0.0) / (n - 1)
+        if not self.weighted:
+            return np.maximum(self._mean("luminance_squared", first, last) - mean * mean, 0.0) / (n - 1)
+        s1, s2, s3 = self.weight_sums
+        squares = self._rows("luminance_squared", first, last) + s2 * mean * mean
+        squares -= 2.0 * mean * self._rows("weighted_luminance", first, last)
+        return np.maximum(squares, 0.0) / (s1 * s1 - 2.0 * s1 * s3 / s2 + s2)
 
     def _aov(self, aov: str, first: int, last: int) -> np.ndarray:
         if aov == "variance":

@@ -46,6 +46,10 @@ if TYPE_CHECKING:
     from wavefront.scene.description import Scene
     from wavefront.scene.device import DeviceScene
 
+# Least weight of a sample; the largest is 1. So small that a pass with it hardly counts; more than zero, so that a
+# render of one pass has an image, and enough that float64 sums of squares of both keep the digits of the variance.
+MIN_SAMPLE_WEIGHT = 1e-3
+
 # Purposes of `GuideState.evaluate`.
 LIGHTS = "lights"
 DIRECTIONS = "directions"
@@ -152,6 +156,7 @@ class Guide(ABC):
         name: Of the method, for checkpoints and accounts.
         key: Hashable values that tell this guide's kernels from those of other settings; with the name in `Features`.
         has_pdf: Whether the density of its directions is known. False for resampling.
+        weighted: Whether samples enter the film with the weight of `sample_weight`, else with 1.
         rounds: Calls of `GuideState.propose` per bounce, 1 or more.
         bsdf_share: Probability of sampling the BSDF where `GuideState.prepare` does not say otherwise; more than 0, at
             most 1. No guide is trusted with all samples: what it never proposes is found by the BSDF.
@@ -163,6 +168,7 @@ class Guide(ABC):
     name: str
     key: tuple = ()
     has_pdf: bool = True
+    weighted: bool = False
     rounds: int = 1
     bsdf_share: float = 0.5
     inputs: tuple[str, ...] = ()
@@ -211,6 +217,23 @@ class Guide(ABC):
     def train(self, records: Records) -> None:
         """Learns from the records of a pass. Called between passes from one thread; states see the result next."""
         raise NotImplementedError("a guide that trains implements this")
+
+    def sample_weight(self, progress: float) -> float:
+        """Weight in the film of the samples of the next pass, if the guide is `weighted`.
+
+        So that noisy samples of a guide that has learned little do not dominate the error, as in the code of Dong, Wang
+        and Li (2023), "Neural Parametric Mixtures for Path Guiding". The image is the mean by these weights. It
+        stays unbiased, because a weight is given before its samples are seen: it must depend on the progress alone. A
+        pass whose weight is not 1 has one sample per pixel, so from where the weight is 1 it must stay 1; else the
+        image depends on the length of passes.
+
+        Args:
+            progress: As in `trains`, which is asked first.
+
+        Returns:
+            `MIN_SAMPLE_WEIGHT` to 1; anything else ends the render with an error.
+        """
+        return 1.0
 
     # --- accounts --------------------------------------------------------------------------------------------------
 

@@ -10,8 +10,9 @@ import time
 import warp as wp
 
 from wavefront import queues
+from wavefront.errors import WavefrontError
 from wavefront.features import Features
-from wavefront.guide import DIRECTIONS, LIGHTS, Guide, GuideContext
+from wavefront.guide import DIRECTIONS, LIGHTS, MIN_SAMPLE_WEIGHT, Guide, GuideContext
 from wavefront.integrator import Kernels, Tile, Worker, skipped_guided_arrays
 from wavefront.proposals import LightProposals, Proposals
 from wavefront.queues import Paths, allocate_struct
@@ -241,6 +242,20 @@ class Guiding:
 
     def trains(self, progress: float) -> bool:
         return self.recorder is not None and self.guide.trains(progress)
+
+    def sample_weight(self, progress: float) -> float:
+        """Of the next pass.
+
+        Raises:
+            WavefrontError: The guide gives one that is out of range.
+        """
+        weight = self.guide.sample_weight(progress) if self.guide.weighted else 1.0
+        if not MIN_SAMPLE_WEIGHT <= weight <= 1.0:
+            raise WavefrontError(
+                f"guide {self.guide.name}: a sample weight of {weight} at progress {progress:.3g}; "
+                f"allowed: {MIN_SAMPLE_WEIGHT} to 1"
+            )
+        return float(weight)
 
     def begin(self, workers: list[GuidedWorker], sample: int) -> None:
         """Before a pass of training, of this sample alone."""

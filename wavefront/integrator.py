@@ -74,6 +74,7 @@ def make_features(scene: description.Scene, device_scene: DeviceScene, guide: Gu
         guide_pdf=guide is None or guide.has_pdf,
         guide_inputs=guide.inputs if guide is not None else (),
         records=guide.records.fields if guide is not None and guide.records is not None else (),
+        weighted=guide is not None and guide.weighted,
     )
 
 
@@ -133,7 +134,7 @@ def make_kernels(f: Features) -> Kernels:
         if not f.guided
         else None,
         advance=advance_guided_bounce if f.guided else advance_bounce,
-        accumulate=make_accumulate(f.variance),
+        accumulate=make_accumulate(f.variance, f.weighted),
     )
 
 

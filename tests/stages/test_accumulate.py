@@ -14,12 +14,12 @@ WIDTH, HEIGHT = 11, 7
 TILE = (3, 2, 5, 4, 6, 3)
 
 
-def accumulate(L, film, tile=TILE, variance=True):
+def accumulate(L, film, tile=TILE, variance=True, weighted=False):
     """Adds the radiances to the film and returns the counters."""
     p, counters = paths(len(L), L=L), Counters()
     tile = array(np.array(tile, np.int32), wp.int32)
     # More threads than pixels in the tile, as in a captured graph.
-    launch(make_accumulate(variance), len(L), p, tile, film.width, film.arrays, counters.array)
+    launch(make_accumulate(variance, weighted), len(L), p, tile, film.width, film.arrays, counters.array)
     return counters
 
 
@@ -47,6 +47,22 @@ def test_sums(variance):
     np.testing.assert_array_equal(film.arrays.L.numpy().reshape(HEIGHT, WIDTH, 3), expected)
     if variance:
         np.testing.assert_allclose(film.arrays.luminance_squared.numpy().reshape(HEIGHT, WIDTH), squares, rtol=1e-6)
+
+
+def test_weighted_sums():
+    """Of dyadic weights and luminances, whose sums have no rounding: w L, (w Y)^2 and w^2 Y."""
+    film = Film(1, 1, ("variance",), "cpu", weighted=True)
+    L = np.array([[3.0, 3.0, 3.0], [8.0, 8.0, 8.0], [0.5, 0.5, 0.5]], np.float32)
+    for weight, first, last in ((0.25, 0, 2), (1.0, 2, 3)):
+        film.begin_pass(weight)
+        accumulate(L[first:last], film, (0, 0, 1, 1, first, last - first), weighted=True)
+        film.end_pass(last - first)
+    assert film.arrays.L.numpy().tolist() == [[0.25 * 11.0 + 0.5] * 3]
+    assert film.arrays.luminance_squared.numpy()[0] == pytest.approx((9.0 + 64.0) / 16.0 + 0.25, rel=1e-6)
+    assert film.arrays.weighted_luminance.numpy()[0] == pytest.approx(11.0 / 16.0 + 0.5, rel=1e-6)
+    assert film.weight_sums == (1.5, 2.0 / 16.0 + 1.0, 2.0 / 64.0 + 1.0)
+    assert (film.sample_count, film.effective_samples) == (3, 1.5**2 / 1.125)
+    np.testing.assert_allclose(film.image(), (0.25 * 11.0 + 0.5) / 1.5, rtol=1e-7)
 
 
 def test_tiles_cover_the_film_once():

@@ -47,15 +47,17 @@ def our_batches(scene: description.Scene, spp: int, name: str, **settings) -> It
     Raises:
         WavefrontError: A contribution was left out because it was not finite.
     """
-    renderer = Renderer(scene, seed=zlib.crc32(name.encode()), guide=None, **settings)
-    before = np.zeros(1)
+    renderer = Renderer(scene, seed=zlib.crc32(name.encode()), **({"guide": None} | settings))
+    before, weight_before = np.zeros(1), 0.0
     while True:
         renderer.render(spp=spp)
         if any(renderer.statistics.nonfinite.values()):
             raise WavefrontError(f"contributions that are not finite: {renderer.statistics.nonfinite}")
         total = renderer.film.arrays.L.numpy().copy()  # float64 sums
-        yield ((total - before) / spp).reshape(renderer.film.height, renderer.film.width, 3)
-        before = total
+        weight = renderer.film.weight_sums[0]
+        mean = (total - before) / (weight - weight_before)
+        yield mean.reshape(renderer.film.height, renderer.film.width, 3)
+        before, weight_before = total, weight
 
 
 def their_batches(scene, max_depth: int, spp: int, seed: int = 0, integrator: str = "path") -> Iterator[np.ndarray]:
