@@ -164,8 +164,8 @@ def describe_render(renderer: Renderer, source: str, started: float, preset: dic
 
 
 def describe_guide(renderer: Renderer) -> dict:
-    """The account of a guided render's guide: ``method``, ``settings`` and ``statistics``; and of the weights of samples,
-    if they have any (see `Film`)."""
+    """The account of a guided render's guide, ``method``, ``settings`` and ``statistics``, and of the weights of
+    samples, if they have any (see `Film`)."""
     film, guide, weights = renderer.film, renderer.guide, {}
     if film.weighted:
         weights = {"sum_of_weights": film.weight_sums[0], "effective_samples_per_pixel": film.effective_samples}
