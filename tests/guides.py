@@ -1,17 +1,22 @@
 """Guides that have learned nothing, and know no better than to mislead: proofs that the protocol is general.
 
 `HistogramGuide` needs two rounds: the second coordinate of a direction has a distribution that depends on the first.
-`ResamplingGuide` has no density. `LobeGuide` is a closed form. `MeanGuide` learns a number, to see that it is kept.
-`RampGuide` gives little weight to what it does before it has learned.
+`ResamplingGuide` has no density. `LobeGuide` is a closed form. `MeanGuide` learns a number, to see that it is kept;
+`ChosenMeanGuide` is the same as a method that presets choose. `RampGuide` gives little weight to what it does before
+it has learned.
 """
 
 from __future__ import annotations
 
 import functools
+import json
+from typing import Annotated
 
+import msgspec
 import numpy as np
 import warp as wp
 
+from guiding import registry
 from wavefront.bsdf.dispatch import make_bsdf
 from wavefront.bsdf.frame import make_frame
 from wavefront.bsdf.tables import MaterialTables
@@ -466,6 +471,43 @@ class MeanGuide(LobeGuide):
 
     def statistics(self):
         return {"records": int(self.sum.numpy()[3])}
+
+
+class MeanSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Of `ChosenMeanGuide`."""
+
+    one_minus_cos: Annotated[float, msgspec.Meta(gt=0.0, le=2.0)]
+    train_share: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.5
+    bsdf_share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.5
+
+
+class ChosenMeanGuide(MeanGuide):
+    """`MeanGuide` with what a method of `guiding.registry` has: settings, a seed, and words for its progress."""
+
+    def __init__(self, settings: MeanSettings, seed: int = 0):
+        super().__init__(**msgspec.structs.asdict(settings))
+        self.settings, self.first_seed = settings, seed
+
+    def identity(self):
+        return {"seed": self.first_seed} | msgspec.structs.asdict(self.settings)
+
+    def progress(self):
+        return f"records so far {self.statistics()['records']}"
+
+
+MEAN_PRESET = {
+    "method": "mean",
+    "description": "A cone around the mean direction of the light.",
+    "settings": {"one_minus_cos": 1.0, "train_share": 0.5, "bsdf_share": 0.5},
+    "sources": {"one_minus_cos": "ours", "train_share": "paper", "bsdf_share": "paper"},
+}
+
+
+def use_mean_preset(monkeypatch, folder) -> None:
+    """Has `guiding.registry` know the preset ``mean``, and no other."""
+    (folder / "mean.json").write_text(json.dumps(MEAN_PRESET))
+    monkeypatch.setattr(registry, "FOLDER", folder)
+    monkeypatch.setitem(registry.METHODS, "mean", ("tests.guides", "MeanSettings", "ChosenMeanGuide"))
 
 
 class RampGuide(MeanGuide):

@@ -269,12 +269,12 @@ def test_the_account_has_the_weights():
     w, account = ramp(), describe_render(r, "scene.json", 0.0)["guide"]
     assert account["sum_of_weights"] == pytest.approx(w.sum(), rel=1e-14)
     assert account["effective_samples_per_pixel"] == pytest.approx(w.sum() ** 2 / (w**2).sum(), rel=1e-14)
-    assert account["name"] == "ramp" and account["records"] > 0
+    assert account["method"] == "ramp" and account["statistics"]["records"] > 0
     assert float(image_attributes(r)["sumOfWeights"]) == r.film.weight_sums[0]
     plain = renderer(MeanGuide())
     plain.render(1)
     assert "sumOfWeights" not in image_attributes(plain)
-    assert set(describe_render(plain, "scene.json", 0.0)["guide"]) == {"name", "records"}
+    assert set(describe_render(plain, "scene.json", 0.0)["guide"]) == {"method", "settings", "statistics"}
 
 
 @pytest.mark.parametrize("stop", [1, 5, 6])

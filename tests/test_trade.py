@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from guiding import guide_of
 from tools import setting_cost, sweep, trade
 from tools.experiment import run_once
 from tools.experiment_spec import MethodSpec, ReferenceSpec, SceneSpec, Spec
@@ -52,7 +53,7 @@ def test_knobs_trade_what_they_say(knob):
     scenes = [load_scene(CORNELL_BOX, knob.overrides(value)) for value in knob.values]
     targets = [json.dumps(target_records(scene)) for scene in scenes]
     assert (len(set(targets)) > 1) == ("bias" in knob.trades)
-    features = {make_features(scene, upload_scene(scene, "cpu")) for scene in scenes}
+    features = {make_features(scene, upload_scene(scene, "cpu"), guide_of(scene)) for scene in scenes}
     assert (len(features) > 1) == ("compile" in knob.trades)
 
 

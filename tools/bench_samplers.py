@@ -60,7 +60,7 @@ def measure(path: Path, arguments: argparse.Namespace, progress) -> dict:
     for seed in range(arguments.seeds):
         names = list(SAMPLERS) if seed % 2 == 0 else list(SAMPLERS)[::-1]
         for name in names:
-            renderer = Renderer(scenes[name], threads=arguments.threads, seed=seed)
+            renderer = Renderer(scenes[name], threads=arguments.threads, seed=seed, guide=None)
             renderer.render(counts[0])
             stack, begin = [renderer.film.image().astype(np.float64)], time.process_time()
             for n in counts[1:]:

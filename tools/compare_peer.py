@@ -165,7 +165,7 @@ def compare_scene(path: Path, arguments: argparse.Namespace, progress) -> Row:
     with tempfile.TemporaryDirectory(prefix="wavefront-peer-") as folder:
         if any(isinstance(emitter, description.SunSky) for emitter in scene.emitters):
             notes.append("sky baked by Mitsuba")
-            own_sky = Renderer(scene, threads=arguments.threads).render(spp=OWN_SKY_SAMPLES)
+            own_sky = Renderer(scene, threads=arguments.threads, guide=None).render(spp=OWN_SKY_SAMPLES)
             baked = bake_sunsky(path, folder)
             scene, xml = replace_records(scene, baked), baked_xml(path, baked, Path(folder) / "baked.xml")
         theirs = peer.load_xml(xml, width, height)

@@ -30,6 +30,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from guiding import plain_settings
 from tools import summary
 from tools.bench_common import machine, require_scipy
 from tools.experiment_spec import PlannedScene, Spec, plan, read_spec
@@ -307,7 +308,7 @@ class Run:
                 MethodEntry(
                     name=method.name,
                     renderer=method.renderer,
-                    overrides=method.overrides,
+                    overrides=method.all_overrides,
                     versions=RENDERERS[method.renderer].versions(self.device),
                 )
                 for method in spec.methods
@@ -326,6 +327,7 @@ class Run:
 
     def _made(self, scene: PlannedScene, method: str, renderer: str) -> dict:
         """What a run depends on besides its key."""
+        guide = plain_settings(scene.jobs[method].scene) if renderer == "wavefront" else None
         return {
             "settings_sha256": self.settings_sha256[scene.name, method],
             "overrides": list(scene.jobs[method].overrides),
@@ -336,7 +338,7 @@ class Run:
             "threads": self.threads,
             "device": self.device,
             "cpu": self.machine["cpu"],
-        }
+        } | ({"guide": guide} if guide else {})
 
     def _done(self) -> set:
         """The runs that need not be made again.

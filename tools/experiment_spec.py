@@ -20,11 +20,13 @@ from tools.reference_store import target_records
 from tools.results import Budget, Struct, slug
 from wavefront.errors import SceneError, WavefrontError
 from wavefront.identity import differences
+from wavefront.scene.description import GuideChoice
 from wavefront.scene.explain import explain
 from wavefront.scene.json_format import parse_object, printable_path
 
 # What a method may change of a scene; all else would be another scene.
 METHOD_KEYS = ("integrator.", "film.filter")
+GUIDE_KEY = "integrator.guide"
 _VARIABLE = re.compile(r"\$\{(\w+)\}")
 
 Name = Annotated[str, Meta(min_length=1, max_length=80)]
@@ -52,11 +54,21 @@ class SceneSpec(Struct):
 
 
 class MethodSpec(Struct):
-    """A method: a renderer, and what it changes of a scene's integrator or reconstruction filter."""
+    """A method: a renderer, what it changes of a scene's integrator or reconstruction filter, and its guide.
+
+    Without a `guide` of its own a method has that of the scene, if there is one; other renderers ignore that.
+    """
 
     name: Name
     renderer: str = "wavefront"
     overrides: list[str] = []
+    guide: GuideChoice | None = None
+
+    @property
+    def all_overrides(self) -> list[str]:
+        """With that of the guide."""
+        guide = [] if self.guide is None else [f"{GUIDE_KEY}={json.dumps(msgspec.to_builtins(self.guide))}"]
+        return [*self.overrides, *guide]
 
 
 class Spec(Struct):
@@ -132,6 +144,9 @@ def check_spec(spec: Spec, path: Path) -> None:
         one_of(f"metrics[{i}]", metric, tuple(METRICS))
     for i, method in enumerate(spec.methods):
         one_of(f"methods[{i}].renderer", method.renderer, tuple(RENDERERS))
+        guided = any(override.strip().startswith(GUIDE_KEY) for override in method.all_overrides)
+        if guided and method.renderer != "wavefront":
+            refuse(f"methods[{i}]", f"a guide for {method.renderer}; allowed: for wavefront")
         for j, override in enumerate(method.overrides):
             if not override.strip().startswith(METHOD_KEYS):
                 refuse(
@@ -250,7 +265,7 @@ def plan(
             _check(RENDERERS[renderer], reference_job, path, f"{where}.reference")
         jobs, notes = {}, {}
         for j, method in enumerate(spec.methods):
-            jobs[method.name] = one = load(f"methods[{j}]", *method.overrides)
+            jobs[method.name] = one = load(f"methods[{j}]", *method.all_overrides)
             _check(RENDERERS[method.renderer], one, path, f"methods[{j}] on {where}")
             notes[method.name] = [
                 f"{key} is {_said(value)}, but {_said(other)} in the reference"

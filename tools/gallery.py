@@ -26,7 +26,7 @@ def tile(path: Path, spp: int) -> Image.Image:
     film = scene.film
     scale = max(TILE[0] / film.width, TILE[1] / film.height)
     film.width, film.height, film.aovs = round(film.width * scale), round(film.height * scale), []
-    image = Image.fromarray(tone_map(Renderer(scene).render(spp=spp)))
+    image = Image.fromarray(tone_map(Renderer(scene, guide=None).render(spp=spp)))
     left, top = (image.width - TILE[0]) // 2, (image.height - TILE[1]) // 2
     return image.crop((left, top, left + TILE[0], top + TILE[1]))
 

@@ -35,6 +35,7 @@ class Knob:
         least_biased: From all values of a sweep, the scene's own first, to the one that the reference has; a knob
             with a bias is measured against it.
         trains: Whether a run that learns is meant, in which fewer samples are not the beginning of more.
+        on_request: It is swept only if it is named.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Knob:
     override: Callable[[Value], str] | None = None
     least_biased: Callable[[Sequence[Value]], Value] = lambda values: values[0]
     trains: bool = False
+    on_request: bool = False
 
     def overrides(self, value: Value) -> list[str]:
         """The changes of a scene that set this value."""
@@ -56,6 +58,10 @@ class Knob:
 
 def _filter(value: Value) -> str:
     return f"film.filter={json.dumps({'type': value})}"
+
+
+def _guide(value: Value) -> str:
+    return f"integrator.guide={json.dumps(None if value is None else {'preset': value})}"
 
 
 def _longest(depths: Sequence[Value]) -> Value:
@@ -71,6 +77,15 @@ KNOBS: dict[str, Knob] = {
         Knob("nee", "integrator.nee", (True, False), ("time", "variance", "memory", "compile")),
         Knob("sampler", "integrator.sampler", ("independent", "sobol"), ("time", "variance", "compile")),
         Knob("filter", "film.filter.type", ("box", "tent", "gaussian"), ("variance", "bias", "compile"), _filter),
+        Knob(
+            "guide",
+            "integrator.guide.preset",
+            (None, "npm-radiance", "npm-product"),
+            ("time", "variance", "memory", "compile"),
+            _guide,
+            trains=True,
+            on_request=True,
+        ),
     )
 }
 

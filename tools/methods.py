@@ -18,11 +18,13 @@ import numpy as np
 import warp as wp
 
 import wavefront
+from guiding import guide_of, plain_settings
 from tools.peers import cycles
 from tools.peers import mitsuba as peer
 from tools.peers.cycles_scene import check_scene
 from tools.peers.mitsuba_records import integrator_of
 from wavefront.errors import WavefrontError
+from wavefront.guided import TRAINING
 from wavefront.identity import scene_hash
 from wavefront.renderer import Renderer
 from wavefront.scene import description, load_scene
@@ -134,14 +136,18 @@ def scene_name(path: str | Path) -> str:
 
 
 class Wavefront:
-    """This renderer."""
-
-    whole = False
-    training_seconds = 0.0  # path tracing has nothing to learn
+    """This renderer, with the guide that the scene names. A guide learns in a share of all samples: in one call."""
 
     def __init__(self, job: Job, seed: int):
-        self.renderer = Renderer(job.scene, device=job.device, threads=job.threads, seed=seed)
+        guide = guide_of(job.scene, seed)
+        self.renderer = Renderer(job.scene, device=job.device, threads=job.threads, seed=seed, guide=guide)
+        self.whole = guide is not None
         self.compile_seconds = self.renderer.statistics.compile_seconds
+
+    @property
+    def training_seconds(self) -> float:
+        seconds = self.renderer.statistics.stage_seconds
+        return sum(seconds.get(stage, 0.0) for stage in TRAINING)
 
     @staticmethod
     def versions(device: str) -> dict[str, str]:
@@ -149,7 +155,7 @@ class Wavefront:
 
     @staticmethod
     def check(job: Job) -> None:
-        pass  # the scene loads
+        plain_settings(job.scene)  # the scene loads; its guide is known
 
     @staticmethod
     def run_seed(names: Sequence[str], seed: int) -> int:
@@ -175,7 +181,7 @@ class Wavefront:
             "shadow_rays": s.shadow_rays,
             "nonfinite": {stage: count for stage, count in s.nonfinite.items() if count},
             "stage_seconds": s.stage_seconds,
-        }
+        } | ({"guide": self.renderer.guide.statistics()} if self.renderer.guide else {})
 
 
 # --- Mitsuba 3 ---------------------------------------------------------------------------------------------------
@@ -226,7 +232,7 @@ class Mitsuba:
             raise WavefrontError("integrator.type: mitsuba has only path")
         for name in integrator.__struct_fields__:
             value, only = getattr(integrator, name), getattr(default, name)
-            if name not in ("max_depth", "rr_depth", "spp") and value != only:
+            if name not in ("max_depth", "rr_depth", "spp", "guide") and value != only:
                 raise WavefrontError(f"integrator.{name} is {json.dumps(value)}; mitsuba has only {json.dumps(only)}")
         if any(isinstance(emitter, description.SunSky) for emitter in scene.emitters):
             raise WavefrontError(

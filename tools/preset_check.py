@@ -205,7 +205,7 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
     files = scenes(console)
     plan = make_plan(
         [scene_path(file) for file in files],
-        {name: knob.values for name, knob in KNOBS.items() if name not in LEFT_OUT},
+        {name: knob.values for name, knob in KNOBS.items() if not (name in LEFT_OUT or knob.on_request)},
         sizes,
         (),
         arguments.seeds,

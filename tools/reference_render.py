@@ -142,12 +142,12 @@ class Maker(Protocol):
 
 
 class WavefrontMaker:
-    """A reference of this renderer, whose film knows the variance."""
+    """A reference of this renderer, whose film knows the variance; unguided: all samples are alike, and independent."""
 
     def __init__(self, job: Job, seed: int):
         job.scene.film.aovs = ["variance"]
         try:
-            self.renderer = Renderer(job.scene, device=job.device, threads=job.threads, seed=seed)
+            self.renderer = Renderer(job.scene, device=job.device, threads=job.threads, seed=seed, guide=None)
         finally:
             job.scene.film.aovs = []
 

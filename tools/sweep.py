@@ -24,6 +24,7 @@ import msgspec
 import numpy as np
 from rich.console import Console
 
+from guiding import plain_settings
 from tools.experiment import Run, write_summary
 from tools.experiment_spec import MethodSpec, PlannedScene, ReferenceSpec, SceneSpec, Spec
 from tools.frontier import SQUARES, Setting, Verdict, bias_figure, error_products, joined, pareto, verdicts
@@ -174,7 +175,7 @@ def make_plan(
 
 def _check_value(knob: Knob, value: Value, job: Job) -> None:
     try:
-        with_overrides(job.scene, knob.overrides(value), job.path)
+        plain_settings(with_overrides(job.scene, knob.overrides(value), job.path))
     except SceneError as error:
         raise WavefrontError(f"--knob {knob.name}={label(value)}: {error}") from None
 

@@ -2,10 +2,11 @@
 
     python -m tools.trade SCENE [--knob NAME[=v1,v2,...] ...] [--spp N,N,... | --seconds S,S,...] [--output FOLDER]
 
-Every knob (`tools.knobs`; by default all of them) is turned on its own, from the scene's settings; then what is on the
-Pareto frontier of time against error is joined in pairs (`--rounds`), or all combinations are taken (`--grid`). Each
-setting is rendered with several seeds. The report names the settings on the frontier, those that are *dominated*
-(another setting takes less time and has less error, and the runs allow to say so), and those that are not separated.
+Every knob (`tools.knobs`; by default all of them but the guide) is turned on its own, from the scene's settings; then
+what is on the Pareto frontier of time against error is joined in pairs (`--rounds`), or all combinations are taken
+(`--grid`). Each setting is rendered with several seeds. The report names the settings on the frontier, those that are
+*dominated* (another setting takes less time and has less error, and the runs allow to say so), and those that are not
+separated.
 Knobs with a bias, such as the longest path, are measured against the reference of the unrestricted scene, and the part
 of an error that is bias is told apart (`tools.frontier`). Each setting is also compiled and rendered once in a process
 of its own with an empty kernel cache, for compile time and peak memory.
@@ -74,7 +75,7 @@ def build_parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar="NAME[=v1,v2,...]",
-        help=f"which to turn, and to what; of {', '.join(KNOBS)}; default: all",
+        help=f"which to turn, and to what; of {', '.join(KNOBS)}; default: all but guide",
     )
     parser.add_argument("--grid", action="store_true", help="all combinations of the values")
     parser.add_argument("--rounds", type=int, default=1, metavar="N", help="of joining pairs; default 1")
@@ -132,7 +133,7 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
     if sizes and (arguments.spp or arguments.seconds):
         raise WavefrontError("--knob spp together with --spp or --seconds; allowed: one of them")
     if not arguments.knob:
-        knobs = {name: knob.values for name, knob in KNOBS.items() if name != SPP}
+        knobs = {name: knob.values for name, knob in KNOBS.items() if name != SPP and not knob.on_request}
     if arguments.spp:
         sizes = numbers(arguments.spp, int, "--spp")
     seconds = numbers(arguments.seconds, float, "--seconds") if arguments.seconds else ()

@@ -1,5 +1,7 @@
 """Checkpoints: what a render needs to go on later as if it had never stopped.
 
+A file of a guide alone (`wavefront.guide_file`) is one of these too, of another kind.
+
 The file is an npz as NumPy reads it, without pickle: an uncompressed ZIP of ``about.json`` and of arrays in sections,
 ``film/L.npy`` and so on. Arrays are streamed, so that no copy of the film is made, and ZIP's checksums tell a damaged
 file. It is written under a temporary name, forced to the disk and then renamed: whenever the process or the machine
@@ -47,13 +49,14 @@ def film_sections(film: Film) -> dict[str, dict[str, wp.array]]:
 # --- writing -----------------------------------------------------------------------------------------------------
 
 
-def write_checkpoint(path: str | os.PathLike, about: dict, sections: Sections) -> None:
+def write_checkpoint(path: str | os.PathLike, about: dict, sections: Sections, kind: str = "checkpoint") -> None:
     """Replaces `path` by a new checkpoint; after an error what was there is still there, and nothing else is.
 
     Args:
         path: The file.
-        about: Plain values; `format` is added.
+        about: Plain values; `format` and `kind` are added.
         sections: One-dimensional arrays by section and name, on any device.
+        kind: What the file is, for those who read it.
 
     Raises:
         CheckpointError: No space, no permission, or another process that writes to the same file.
@@ -64,7 +67,7 @@ def write_checkpoint(path: str | os.PathLike, about: dict, sections: Sections) -
         with _locked(temporary) as file:
             try:
                 with zipfile.ZipFile(file, "w") as archive:
-                    text = json.dumps({"format": FORMAT} | about, indent=1)
+                    text = json.dumps({"format": FORMAT, "kind": kind} | about, indent=1)
                     archive.writestr(zipfile.ZipInfo(_ABOUT, _OLDEST_DATE), text)
                     for section, arrays in sections.items():
                         for name, array in arrays.items():
@@ -133,7 +136,12 @@ def _reason(error: BaseException) -> str:
 
 
 def read_checkpoint(
-    path: str | os.PathLike, identity: dict, sections: Sections, check: Callable[[dict], None] = lambda about: None
+    path: str | os.PathLike,
+    identity: dict,
+    sections: Sections,
+    check: Callable[[dict], None] = lambda about: None,
+    kind: str = "checkpoint",
+    of: str = "render",
 ) -> dict:
     """Reads a checkpoint into `sections`, which are changed only if the whole file is sound and is of this render.
 
@@ -142,6 +150,8 @@ def read_checkpoint(
         identity: What `about["identity"]` must be.
         sections: Arrays to fill, of the shapes and types that were written.
         check: Called with `about` before anything is changed; may raise a CheckpointError.
+        kind: What the file must be.
+        of: What a file of this kind belongs to, for messages.
 
     Returns:
         `about`.
@@ -158,7 +168,7 @@ def read_checkpoint(
         try:
             with zipfile.ZipFile(file) as archive:
                 about = json.loads(archive.read(_ABOUT))
-                _check_identity(path, about, identity)
+                _check_identity(path, about, identity, kind, of)
                 check(about)
                 damaged = archive.testzip()
                 if damaged is not None:
@@ -176,15 +186,18 @@ def read_checkpoint(
             raise
         except Exception as error:  # zipfile and json raise a dozen kinds on bytes that make no sense
             text = " ".join(str(error).split())
-            raise CheckpointError(f"{path}: not a checkpoint, or a damaged one: {text}") from None
+            raise CheckpointError(f"{path}: not a {kind}, or a damaged one: {text}") from None
 
 
-def _check_identity(path: Path, about: dict, identity: dict) -> None:
+def _check_identity(path: Path, about: dict, identity: dict, kind: str, of: str) -> None:
     if about["format"] != FORMAT:
         raise CheckpointError(f"{path}: format {about['format']} of checkpoints; this version reads {FORMAT}")
-    differs = explain_differences(json.loads(json.dumps(identity)), about["identity"], "the checkpoint")
+    there = about.get("kind", "checkpoint")
+    if there != kind:
+        raise CheckpointError(f"{path}: is a {there}; allowed: a {kind}")
+    differs = explain_differences(json.loads(json.dumps(identity)), about["identity"], f"the {kind}")
     if differs:
-        raise CheckpointError(f"{path}: is a checkpoint of another render: {differs}")
+        raise CheckpointError(f"{path}: is a {kind} of another {of}: {differs}")
 
 
 def _check_array(entry: IO[bytes], name: str, array: wp.array) -> None:

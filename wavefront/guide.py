@@ -265,6 +265,10 @@ class Guide(ABC):
         """What a user may want to know of the guide so far, as plain JSON values."""
         return {}
 
+    def progress(self) -> str:
+        """How training goes, in a few words such as ``loss 1.234, step 600``: shown after each pass that trains."""
+        return ""
+
 
 def check_guide(guide: Guide) -> None:
     """Raises WavefrontError for attributes that are out of range."""

@@ -27,6 +27,8 @@ from wavefront.stages.guided_record import make_record_arrivals, put_throughput_
 from wavefront.stages.guided_resolve import make_guided_resolve
 from wavefront.stages.guided_vertices import make_guided_vertices
 
+TRAINING = ("records", "guide train")  # stages between passes: records are collected, the guide learns
+
 
 def make_guided_kernels(f: Features) -> dict[str, wp.Kernel]:
     """The kernels of a guided bounce that others do not have, by the label of their stage."""
@@ -271,5 +273,5 @@ class Guiding:
         self.guide.train(records)
         if self.device != "cpu":
             wp.synchronize_device(self.device)
-        for name, value in (("records", collected - start), ("guide train", time.perf_counter() - collected)):
+        for name, value in zip(TRAINING, (collected - start, time.perf_counter() - collected), strict=True):
             self.seconds[name] = self.seconds.get(name, 0.0) + value

@@ -12,15 +12,16 @@ from wavefront.scene import description
 from wavefront.scene.lookup import NUMBER_FIELDS, walk
 
 _LISTED = 4  # differences that a message lists at most
-# Keys that say how many samples there are and how they are written, not what they are samples of.
-_OMITTED = (("integrator", "spp"), ("film", "precision"))
+# Keys that say how many samples there are and how they are written, not what they are samples of; and the guide, which
+# is part of a renderer's identity with all its settings.
+_OMITTED = (("integrator", "spp"), ("integrator", "guide"), ("film", "precision"))
 
 
 def scene_records(scene: description.Scene) -> dict:
     """The records of a scene as plain values that can be compared with those of another.
 
     Files are in it by the SHA-256 of their contents, wherever they lie, and so are long lists of numbers. The number of
-    samples and the precision of the output are left out.
+    samples, the guide and the precision of the output are left out.
     """
     files: dict[str, str] = {}
     for _, record in walk(scene):

@@ -7,6 +7,7 @@ import json
 import os
 import platform
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
@@ -60,8 +61,8 @@ def check_writable(path: Path) -> None:
         raise WavefrontError(f"{path}: cannot be written: {error.strerror or error}") from None
 
 
-def check_not_read(exr: Path, source: str | os.PathLike, scene: description.Scene) -> None:
-    """Refuses an output that would replace the scene file, or an image or mesh of the scene.
+def check_not_read(paths: Sequence[Path], source: str | os.PathLike, scene: description.Scene) -> None:
+    """Refuses files to write that would replace the scene file, or an image or mesh of the scene.
 
     Raises:
         WavefrontError: Names the file.
@@ -69,7 +70,7 @@ def check_not_read(exr: Path, source: str | os.PathLike, scene: description.Scen
     read = {os.path.realpath(source)} | {
         os.path.realpath(record.file) for _, record in walk(scene) if getattr(record, "file", None)
     }
-    for path in output_paths(exr):
+    for path in paths:
         if os.path.realpath(path) in read:
             raise WavefrontError(
                 f"{path}: would be overwritten, but the scene is read from it; choose another name with -o"
@@ -163,11 +164,12 @@ def describe_render(renderer: Renderer, source: str, started: float, preset: dic
 
 
 def describe_guide(renderer: Renderer) -> dict:
-    """The account of a guided render's guide, and of the weights of samples if they have any (see `Film`)."""
-    film, weights = renderer.film, {}
+    """The account of a guided render's guide, ``method``, ``settings`` and ``statistics``, and of the weights of
+    samples, if they have any (see `Film`)."""
+    film, guide, weights = renderer.film, renderer.guide, {}
     if film.weighted:
         weights = {"sum_of_weights": film.weight_sums[0], "effective_samples_per_pixel": film.effective_samples}
-    return {"name": renderer.guide.name} | weights | renderer.guide.statistics()
+    return {"method": guide.name, "settings": guide.identity(), "statistics": guide.statistics()} | weights
 
 
 def write_film(exr: Path, renderer: Renderer, half: bool) -> None:

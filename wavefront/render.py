@@ -22,6 +22,9 @@ import wavefront
 from wavefront.checkpoint import CheckpointError, CheckpointWriter
 from wavefront.errors import WavefrontError
 from wavefront.film import CHANNELS
+from wavefront.guide import Guide
+from wavefront.guide_file import load_guide, save_guide
+from wavefront.guide_options import add_guide_options, check_guide_files, guide_overrides, in_words, make_guide
 from wavefront.output import (
     check_image_path,
     check_not_read,
@@ -141,6 +144,8 @@ def build_parser() -> argparse.ArgumentParser:
         help="value of a $NAME of a Mitsuba scene; camera=NAME or scene=NAME of a glTF file",
     )
 
+    add_guide_options(parser)
+
     long = parser.add_argument_group("long renders")
     long.add_argument("--checkpoint", metavar="FILE", help="save what a later --resume needs, from time to time")
     long.add_argument("--every", type=float, metavar="S", help="seconds between checkpoints; default 300")
@@ -204,7 +209,7 @@ def overrides_from(arguments: argparse.Namespace) -> list[str]:
         overrides.append(f"integrator.sampler={arguments.sampler}")
     if arguments.spp is not None:
         overrides.append(f"integrator.spp={arguments.spp}")
-    return overrides + arguments.set
+    return overrides + guide_overrides(arguments) + arguments.set
 
 
 def definitions_from(arguments: argparse.Namespace) -> dict[str, str]:
@@ -259,6 +264,7 @@ def run_with_progress(
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
+        *([TextColumn("{task.fields[guide]}", markup=False)] if renderer.guide else []),
     )
     film, workers = renderer.film, f" with {renderer.threads} threads" if renderer.device == "cpu" else ""
     with Interrupt(console) as interrupt, Progress(*columns, console=console) as progress:
@@ -268,7 +274,7 @@ def run_with_progress(
             highlight=False,
             soft_wrap=True,
         )
-        task = progress.add_task("", total=seconds or spp, spp="0 spp", rate="")
+        task = progress.add_task("", total=seconds or spp, spp="0 spp", rate="", guide="")
 
         def update(r: Renderer) -> bool:
             s = r.statistics
@@ -276,7 +282,11 @@ def run_with_progress(
             completed = min(s.render_seconds - begun, seconds) if seconds else s.sample_count
             wanted = "" if seconds else f"/{spp}"
             progress.update(
-                task, completed=completed, spp=f"{s.sample_count}{wanted} spp", rate=f"{rate / 1e6:.2f} Mrays/s"
+                task,
+                completed=completed,
+                spp=f"{s.sample_count}{wanted} spp",
+                rate=f"{rate / 1e6:.2f} Mrays/s",
+                guide=r.guide.progress() if r.training else "",
             )
             if checkpoints is not None:
                 checkpoints.after_pass()
@@ -344,7 +354,7 @@ def print_profile(renderer: Renderer, console: Console) -> None:
     console.print(table)
 
 
-def make_renderer(arguments: argparse.Namespace, scene: Scene, console: Console) -> Renderer:
+def make_renderer(arguments: argparse.Namespace, scene: Scene, guide: Guide | None, console: Console) -> Renderer:
     """The renderer of a scene as the command line says."""
     return Renderer(
         scene,
@@ -356,6 +366,7 @@ def make_renderer(arguments: argparse.Namespace, scene: Scene, console: Console)
         strict=arguments.strict,
         profile=arguments.profile,
         on_compile=lambda message: console.print(message, highlight=False),
+        guide=guide,
     )
 
 
@@ -366,7 +377,8 @@ def run_trace(arguments: argparse.Namespace, console: Console, warn: Callable[[s
         WavefrontError: With the one line that the user needs.
     """
     scene = load_scene(arguments.scene, overrides_from(arguments), definitions_from(arguments), warn)
-    trace = make_renderer(arguments, scene, console).trace(*arguments.pixel, arguments.sample or 0)
+    renderer = make_renderer(arguments, scene, make_guide(scene, arguments), console)
+    trace = renderer.trace(*arguments.pixel, arguments.sample or 0)
     if arguments.json:
         print(trace.to_json())
     elif arguments.trace:
@@ -402,13 +414,15 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
     check_image_path(output)
     resume, checkpoint = check_checkpoints(arguments, output)
     scene = load_scene(arguments.scene, overrides_from(arguments), definitions_from(arguments), warn)
-    check_not_read(output, arguments.scene, scene)
+    check_not_read(output_paths(output), arguments.scene, scene)
+    guide = make_guide(scene, arguments)
+    check_guide_files(arguments, scene, output, resume, checkpoint)
     preset = None
     if arguments.preset is not None:
         preset = load_preset(arguments.preset).account(scene, timed=seconds is not None)
         bias = f"; biased by {', '.join(preset['biased_by'])}" if preset["biased_by"] else ""
         console.print(f"preset {arguments.preset}{bias}", highlight=False, soft_wrap=True)
-    renderer = make_renderer(arguments, scene, console)
+    renderer = make_renderer(arguments, scene, guide, console)
     for note in renderer.device_scene.notes:
         warn(note)
     spp = None if seconds else scene.integrator.spp
@@ -418,6 +432,8 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
         console.print(message, highlight=False, soft_wrap=True)
         if spp is not None and spp < renderer.sample_count:
             warn(f"{resume} holds more samples than the {spp} asked for, and all are in the image")
+    elif arguments.load_guide is not None:  # what is resumed has its own, which began with it
+        load_guide(guide, arguments.load_guide)
     checkpoints = None
     if checkpoint is not None:
         saved = renderer.sample_count if resume == checkpoint else None
@@ -430,6 +446,12 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
         raise WavefrontError(f"{error}; no image was written{kept}") from None
     if checkpoints is not None:
         checkpoints.write()
+    lost = None
+    if arguments.save_guide is not None:
+        try:
+            save_guide(guide, arguments.save_guide)
+        except CheckpointError as error:
+            lost = error  # once the image is written
     account = describe_render(renderer, arguments.scene, started, preset)
     try:
         write_outputs(output, renderer, arguments.exposure, account)
@@ -445,6 +467,8 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
             )
     if arguments.profile:
         print_profile(renderer, console)
+    if guide is not None:
+        console.print(in_words(guide), highlight=False, soft_wrap=True)
     s = renderer.statistics
     console.print(
         f"{output}: {s.sample_count} samples per pixel in {s.render_seconds:.1f} s"
@@ -452,6 +476,8 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
         highlight=False,
         soft_wrap=True,
     )
+    if lost is not None:
+        raise lost
     return EXIT_SIGNAL + interrupted if interrupted else 0
 
 

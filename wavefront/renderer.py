@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 
+import msgspec
 import numpy as np
 import warp as wp
 
@@ -114,14 +115,22 @@ class Renderer:
             writing the film takes come off it.
         seed: Of the random numbers. Same seed and device, same image.
         strict: A contribution that is not finite or negative is an error that names the path; else it is counted.
-        guide: Of the directions of paths, see `wavefront.guide`.
+        guide: Of the directions of paths, see `wavefront.guide`; None: unguided, also where the scene names a guide.
+            A scene that names one needs either, because methods are no part of the renderer: `guiding.guide_of(scene)`
+            makes it.
         profile: On CUDA, time every stage, at the price of a synchronisation after each.
         on_compile: Called with a message before kernels are compiled.
 
+    Attributes:
+        scene: The records, checked; a copy.
+        guide: As given, or None.
+        training: Whether the guide learned from the last pass.
+        statistics: See `Statistics`.
+
     Raises:
         SceneError: The scene cannot be rendered.
-        WavefrontError: Unknown device, a budget that is too small, or a guide with settings out of range or in a strict
-            render.
+        WavefrontError: Unknown device, a budget that is too small, or a guide with settings out of range, in a strict
+            render, or named by the scene and not given.
     """
 
     def __init__(
@@ -135,27 +144,36 @@ class Renderer:
         strict: bool = False,
         profile: bool = False,
         on_compile: Callable[[str], None] | None = None,
-        guide: Guide | None = None,
+        guide: Guide | msgspec.UnsetType | None = msgspec.UNSET,
     ):
         if not 0 <= seed < 2**64:
             raise WavefrontError(f"seed {seed} is out of range; allowed: 0 to 2^64 - 1")
         if threads is not None and threads < 1:
             raise WavefrontError(f"{threads} threads; allowed: 1 or more")
-        if guide is not None:
+        scene = checked(scene)  # a scene built in Python gets the checks that a file gets, and a copy is kept
+        if guide is msgspec.UNSET:
+            if scene.integrator.guide is not None:
+                raise WavefrontError(
+                    f"integrator.guide names {scene.integrator.guide.preset!r}, and Renderer makes no guides; allowed: "
+                    "guide=guiding.guide_of(scene), or guide=None to render without"
+                )
+            guide = None
+        if guide is None:
+            scene.integrator.guide = None
+        else:
             check_guide(guide)
             if strict:
                 raise WavefrontError(
                     f"a strict render traces paths again, which a guide that has learned since would not repeat; "
                     f"allowed: a guide ({guide.name}) or a strict render"
                 )
-        scene = checked(scene)  # a scene built in Python gets the checks that a file gets, and a copy is kept
         self.warnings = validate(scene)
         self.scene, self.device, self.seed, self.strict = scene, resolve_device(device), seed, strict
         self.device_scene = upload_scene(scene, self.device)
         self.warnings += self.device_scene.notes
         self.features = make_features(scene, self.device_scene, guide)
         self.kernels = make_kernels(self.features)
-        self.guide, self._guiding = guide, None
+        self.guide, self._guiding, self.training = guide, None, False
         if guide is not None:
             guide.threads = threads
             self._guiding = Guiding(guide, scene, self.device_scene, self.features, self.device)
@@ -277,6 +295,7 @@ class Renderer:
                 weight = self._guiding.sample_weight(progress)
                 samples = 1 if training or weight != 1.0 else samples
             self._pass(samples, training, weight)
+            self.training = training
             now = time.perf_counter()
             self.statistics.render_seconds = elapsed_before + now - begin
             if callback is not None and callback(self):

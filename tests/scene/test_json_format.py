@@ -228,7 +228,7 @@ def test_overrides_change_what_is_there_and_add_what_is_not(write):
         (
             "integrator.max_dept=6",
             "integrator: unknown key 'max_dept'; did you mean 'max_depth' or 'rr_depth'? "
-            "valid keys: type, max_depth, rr_depth, nee, sampler, spp (set by 'integrator.max_dept=6')",
+            "valid keys: type, max_depth, rr_depth, nee, sampler, spp, guide (set by 'integrator.max_dept=6')",
         ),
         (
             "film.width=big",

@@ -242,7 +242,7 @@ class _Writer:
             )
         for name in integrator.__struct_fields__:
             value, only = getattr(integrator, name), getattr(default, name)
-            if name not in ("max_depth", "rr_depth", "spp", "nee") and value != only:
+            if name not in ("max_depth", "rr_depth", "spp", "nee", "guide") and value != only:
                 raise WavefrontError(f"integrator.{name} is {json.dumps(value)}; with cycles: {json.dumps(only)}")
         if not isinstance(film.filter, description.BoxFilter):
             raise WavefrontError(f"film.filter.type is {type(film.filter).__struct_config__.tag}; with cycles: box")

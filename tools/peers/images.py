@@ -47,7 +47,7 @@ def our_batches(scene: description.Scene, spp: int, name: str, **settings) -> It
     Raises:
         WavefrontError: A contribution was left out because it was not finite.
     """
-    renderer = Renderer(scene, seed=zlib.crc32(name.encode()), **settings)
+    renderer = Renderer(scene, seed=zlib.crc32(name.encode()), **({"guide": None} | settings))
     before, weight_before = np.zeros(1), 0.0
     while True:
         renderer.render(spp=spp)

@@ -9,7 +9,7 @@ image (first row of the file), as in glTF. A camera looks along its local -Z wit
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
@@ -672,6 +672,23 @@ class Film(Record):
         return self.crop or Crop(width=self.width, height=self.height)
 
 
+class GuideChoice(Record):
+    """A guide, which learns where light comes from and proposes directions; it changes the noise and not the image."""
+
+    preset: Annotated[str, Meta(min_length=1, description="Name of a preset of guiding/presets, such as npm-product.")]
+    train_share: Annotated[
+        Fraction | None,
+        Meta(description="Share of the samples, or of the time, in which the guide learns; null: that of the preset."),
+    ] = None
+    bsdf_share: Annotated[
+        Annotated[float, Meta(gt=0.0, le=1.0)] | None,
+        Meta(description="Probability of BSDF sampling, where the guide says no other; null: that of the preset."),
+    ] = None
+    settings: Annotated[
+        dict[str, Any], Meta(description="Further settings of the method, by name, in place of those of the preset.")
+    ] = {}
+
+
 class PathIntegrator(Record, tag_field="type", tag="path"):
     """Unidirectional path tracing with multiple importance sampling."""
 
@@ -698,6 +715,7 @@ class PathIntegrator(Record, tag_field="type", tag="path"):
         ),
     ] = "independent"
     spp: Annotated[int, Meta(ge=1, le=2**31 - 1, description="Samples per pixel.")] = 64
+    guide: Annotated[GuideChoice | None, Meta(description="Path guiding; null: none.")] = None
 
 
 class Scene(Record):

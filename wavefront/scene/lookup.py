@@ -138,8 +138,11 @@ def walk(record: description.Record, path: str = "") -> Iterator[tuple[str, desc
 
 
 def value_at(scene: description.Scene, key: str) -> object:
-    """A setting of a scene by the key of its override, such as ``integrator.max_depth`` or ``film.filter.type``."""
+    """A setting of a scene by the key of its override, such as ``integrator.max_depth`` or ``film.filter.type``; None
+    for one of a record that is not there."""
     value = scene
     for step in key.split("."):
+        if value is None:
+            return None
         value = value.__struct_config__.tag if step == "type" else getattr(value, step)
     return value
