@@ -48,6 +48,8 @@ class NpmSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         product_cosine: Train that product, on the target times the cosine; else the mixture alone, on the target.
         mis_aware: Weight the target by the guide's part of the density of the mixture of techniques.
         learned_share: The network also gives the share of BSDF sampling, from `bsdf_share` at the beginning.
+        brightness_cells: Divide the target by its mean in cells of a grid of so many per axis, so that dark places are
+            learned like bright ones; 0: do not. The optimum at each place is the same.
         whole_emission: With light sampling: learn all light; else the emission that lights are sampled for counts by
             its weight against light sampling.
         bsdf_share: Probability of sampling the BSDF, more than 0.
@@ -73,6 +75,7 @@ class NpmSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     product_cosine: bool = False
     mis_aware: bool = True
     learned_share: bool = False
+    brightness_cells: Annotated[int, msgspec.Meta(ge=0, le=256)] = 0
     whole_emission: bool = False
     bsdf_share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.5
     train_share: Fraction = 0.25
@@ -195,19 +198,22 @@ class NpmGuide(Guide):
         self.kernels = npm_kernels.make_kernels(
             s.product, s.cosine_aware, s.learned_share, features.sampler, self.mixture
         )
-        self.gather_batch = npm_kernels.make_gather_batch(
+        self.weigh_records, self.gather_batch = npm_kernels.make_training(
             s.product, s.mis_aware, s.product_cosine, s.vertex_loss, s.whole_emission
         )
+        cells = 2 * s.brightness_cells**3 + 2
+        self.cells = wp.zeros(cells if s.brightness_cells else 1, dtype=wp.float64, device=device)
         self.kl_loss = self.mixture.kl_loss
         if s.vertex_loss:
             self.kl_loss = npm_kernels.make_vertex_loss(
                 self.mixture, s.cosine_aware, s.product_cosine, s.mis_aware, s.learned_share, s.bsdf_share
             )
         self.account = wp.zeros(2, dtype=wp.int64, device=device)  # passes, records
-        self.batch = wp.zeros(0, dtype=wp.float32, device=device)
+        self.batch, self.weights = (wp.zeros(0, dtype=wp.float32, device=device) for _ in range(2))
 
     def modules(self):
-        return [kernel.module for kernel in (*self.kernels, self.gather_batch)]
+        training = self.weigh_records, self.gather_batch, npm_kernels.sum_brightness
+        return [kernel.module for kernel in (*self.kernels, *training)]
 
     def make_state(self, context):
         return NpmState(self, context)
@@ -236,16 +242,17 @@ class NpmGuide(Guide):
         arrays = RecordArrays()
         for name in self.records.fields:
             setattr(arrays, name, getattr(records, name))
+        if self.weights.size < n:
+            self.weights = wp.empty(n, dtype=wp.float32, device=self.device)
+        self._launch(self.weigh_records, n, [arrays, s.bsdf_share], [self.weights])
+        if s.brightness_cells:
+            inputs = [records.position, self.weights, *self.unit_cube, s.brightness_cells]
+            self._launch(npm_kernels.sum_brightness, n, inputs, [self.cells])
         for k in range(steps):
             count = len(range(k, n, steps))
             x, target = self._batch(count)
-            wp.launch(
-                self.gather_batch,
-                dim=count,
-                inputs=[arrays, k, steps, s.bsdf_share, *self.unit_cube],
-                outputs=[x, target],
-                device=self.device,
-            )
+            inputs = [arrays, self.weights, self.cells, s.brightness_cells, k, steps, *self.unit_cube]
+            self._launch(self.gather_batch, count, inputs, [x, target])
             last = k == steps - 1
             loss = self.model.train_step(x, target, loss=self.kl_loss, report=last)
         if steps:
@@ -253,6 +260,10 @@ class NpmGuide(Guide):
         self.passes += 1
         self.record_count += n
         self.account.assign(np.array([self.passes, self.record_count], np.int64))
+
+    def _launch(self, kernel: wp.Kernel, count: int, inputs: list, outputs: list) -> None:
+        if count:
+            wp.launch(kernel, dim=count, inputs=inputs, outputs=outputs, device=self.device)
 
     def _batch(self, count: int) -> tuple[wp.array, wp.array]:
         """Inputs and targets of a batch, in storage that grows to the largest so far."""
@@ -270,7 +281,8 @@ class NpmGuide(Guide):
 
     def arrays(self):
         network = {"parameters": self.model.parameters, **self.model.optimizer.arrays()}
-        return {name: array for name, array in network.items() if array.size} | {"account": self.account}
+        learned = network | {"account": self.account, "brightness": self.cells}
+        return {name: array for name, array in learned.items() if array.size}
 
     def restored(self):
         self.passes, self.record_count = (int(value) for value in self.account.numpy())

@@ -16,6 +16,7 @@ from wavefront.sampler import SAMPLERS
 
 _INV_PI = wp.constant(1.0 / math.pi)
 _SMALLEST_COSINE = wp.constant(1.0e-4)  # f = (f cos) / cos is not known below; such records do not train
+_PRIOR = wp.constant(16.0)  # records
 
 
 @wp.func
@@ -155,35 +156,20 @@ def make_kernels(product: bool, cosine_aware: bool, learned_share: bool, sampler
 
 
 @functools.cache
-def make_gather_batch(product: bool, mis_aware: bool, product_cosine: bool, vertex_loss: bool, whole_emission: bool):
-    """Kernel of training: the inputs and targets of a batch, from every `stride`-th record; see `NpmSettings`."""
+def make_training(product: bool, mis_aware: bool, product_cosine: bool, vertex_loss: bool, whole_emission: bool):
+    """Kernels of training: `weigh_records` and `gather_batch`; the arguments as in `NpmSettings`."""
     write_inputs = make_write_inputs(product)
 
     @wp.kernel(enable_backward=False, module="unique")
-    def gather_batch(
+    def weigh_records(
         records: RecordArrays,
-        first: int,
-        stride: int,
         bsdf_share: float,
-        origin: wp.vec3,
-        scale: wp.vec3,
         # out
-        x: wp.array2d[wp.float32],
-        target: wp.array2d[wp.float32],
+        weights: wp.array[wp.float32],
     ):
-        row = wp.tid()
-        i = first + row * stride
-        wi = records.wi[i]
-        wo = records.wo[i]
-        normal = records.normal[i]
+        """Target over the density of the direction, one thread per record; zero if it is not finite."""
+        i = wp.tid()
         pdf = records.pdf[i]
-        roughness = float(0.0)
-        if wp.static(product):
-            roughness = records.roughness[i]
-        through = records.transmits[i]
-        write_inputs(x, row, records.position[i], normal, wo, roughness, through, origin, scale)
-
-        # target / p
         L = records.radiance[i]
         if wp.static(whole_emission):
             L += records.taken[i]
@@ -192,19 +178,48 @@ def make_gather_batch(product: bool, mis_aware: bool, product_cosine: bool, vert
             L = wp.cw_mul(records.weight[i], L)
             weight = (L[0] + L[1] + L[2]) / 3.0
             if wp.static(not product_cosine):
-                cosine = wp.abs(wp.dot(normal, wi))
+                cosine = wp.abs(wp.dot(records.normal[i], records.wi[i]))
                 weight = wp.where(cosine > _SMALLEST_COSINE, weight / cosine, 0.0)
         else:
             weight = (L[0] + L[1] + L[2]) / (3.0 * pdf)
             if wp.static(product_cosine):
-                weight *= wp.abs(wp.dot(normal, wi))
+                weight *= wp.abs(wp.dot(records.normal[i], records.wi[i]))
         weight /= records.survival[i]
-        if records.guide_pdf[i] == 0.0:  # the guide had no say, or no hope
-            weight *= wp.where(wp.static(mis_aware), 0.0, 1.0)
-        if wp.static(mis_aware and not vertex_loss):
-            weight *= (1.0 - bsdf_share) * records.guide_pdf[i] / pdf
-        if not wp.isfinite(weight):
-            weight = 0.0
+        if wp.static(mis_aware):
+            if wp.static(vertex_loss):  # the loss weighs by what the guide is then
+                weight *= wp.where(records.guide_pdf[i] > 0.0, 1.0, 0.0)
+            else:
+                weight *= (1.0 - bsdf_share) * records.guide_pdf[i] / pdf
+        weights[i] = wp.where(wp.isfinite(weight), weight, 0.0)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def gather_batch(
+        records: RecordArrays,
+        weights: wp.array[wp.float32],
+        cells: wp.array[wp.float64],
+        cells_per_axis: int,
+        first: int,
+        stride: int,
+        origin: wp.vec3,
+        scale: wp.vec3,
+        # out
+        x: wp.array2d[wp.float32],
+        target: wp.array2d[wp.float32],
+    ):
+        """Inputs and targets of a batch: every `stride`-th record from `first` on."""
+        row = wp.tid()
+        i = first + row * stride
+        wo = records.wo[i]
+        normal = records.normal[i]
+        through = records.transmits[i]
+        roughness = float(0.0)
+        if wp.static(product):
+            roughness = records.roughness[i]
+        write_inputs(x, row, records.position[i], normal, wo, roughness, through, origin, scale)
+        weight = weights[i]
+        if cells_per_axis > 0:
+            weight /= brightness(cells, cells_per_axis, cell_of(records.position[i], origin, scale, cells_per_axis))
+        wi = records.wi[i]
         target[row, 0] = wi[0]
         target[row, 1] = wi[1]
         target[row, 2] = wi[2]
@@ -216,7 +231,50 @@ def make_gather_batch(product: bool, mis_aware: bool, product_cosine: bool, vert
             target[row, 6] = axis[2]
             target[row, 7] = records.bsdf_pdf[i]
 
-    return gather_batch
+    return weigh_records, gather_batch
+
+
+# Brightness: sums of weights and numbers of records, by cell of a grid over the bounds, and of all at the end.
+
+
+@wp.func
+def cell_of(position: wp.vec3, origin: wp.vec3, scale: wp.vec3, cells_per_axis: int) -> int:
+    cell = int(0)
+    for i in range(3):
+        part = int((position[i] - origin[i]) * scale[i] * float(cells_per_axis))
+        cell = cell * cells_per_axis + wp.clamp(part, 0, cells_per_axis - 1)
+    return cell
+
+
+@wp.func
+def brightness(cells: wp.array[wp.float64], cells_per_axis: int, cell: int) -> float:
+    """Mean weight of the records of a cell, of `_PRIOR` more that have the mean of all; 1 where nothing is known."""
+    last = 2 * cells_per_axis * cells_per_axis * cells_per_axis
+    mean = cells[last] / wp.max(cells[last + 1], wp.float64(1.0))
+    prior = wp.float64(_PRIOR)
+    value = (cells[2 * cell] + prior * mean) / (cells[2 * cell + 1] + prior)
+    return wp.where(value > wp.float64(0.0), wp.float32(value), 1.0)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def sum_brightness(
+    position: wp.array[wp.vec3],
+    weights: wp.array[wp.float32],
+    origin: wp.vec3,
+    scale: wp.vec3,
+    cells_per_axis: int,
+    # out
+    cells: wp.array[wp.float64],
+):
+    """Adds all records; one launch on the CPU device, in their order."""
+    i = wp.tid()
+    weight = wp.float64(weights[i])
+    cell = cell_of(position[i], origin, scale, cells_per_axis)
+    last = 2 * cells_per_axis * cells_per_axis * cells_per_axis
+    wp.atomic_add(cells, 2 * cell, weight)
+    wp.atomic_add(cells, 2 * cell + 1, wp.float64(1.0))
+    wp.atomic_add(cells, last, weight)
+    wp.atomic_add(cells, last + 1, wp.float64(1.0))
 
 
 @functools.cache

@@ -158,7 +158,8 @@ def test_what_is_seen_through_a_mask_keeps_its_samples():
 def test_a_guide_without_records_allocates_none():
     learning = Renderer(load("cornell-box"), threads=1, guide=MeanGuide())
     still = Renderer(load("cornell-box"), threads=1, guide=LobeGuide())
-    assert still.bytes_per_path == learning.bytes_per_path - 5 * 12 - 4
+    inputs = 2 * 4
+    assert still.bytes_per_path == learning.bytes_per_path - 5 * 12 - 4 - inputs
     assert not still.workers[0].scratch.beta
     assert still.kernels.emission is learning.kernels.emission
 

@@ -15,7 +15,7 @@ import warp as wp
 from guiding.distributions.vmf import COSINE_KAPPA
 from guiding.distributions.vmf_mixture import make_vmf_mixture
 from guiding.npm import NpmGuide, NpmSettings
-from guiding.npm_kernels import make_gather_batch, make_vertex_loss
+from guiding.npm_kernels import make_training, make_vertex_loss
 from nn import Model
 from tests.guiding import vmf_oracle as oracle
 from wavefront.guide import GuideVertex
@@ -98,10 +98,12 @@ def test_targets(product, mis_aware, product_cosine, vertex_loss, whole_emission
     rows = range(first, n, stride)
     x = wp.zeros((len(rows), 9 if product else 3), dtype=wp.float32, device=DEVICE)
     target = wp.zeros((len(rows), 8), dtype=wp.float32, device=DEVICE)
-    kernel = make_gather_batch(product, mis_aware, product_cosine, vertex_loss, whole_emission)
+    weigh, gather = make_training(product, mis_aware, product_cosine, vertex_loss, whole_emission)
+    weights, cells = wp.zeros(n, dtype=wp.float32, device=DEVICE), wp.zeros(1, dtype=wp.float64, device=DEVICE)
+    wp.launch(weigh, dim=n, inputs=[arrays, share], outputs=[weights], device=DEVICE)
     origin, scale = wp.vec3(*BOUNDS[0]), wp.vec3(*(1.0 / (BOUNDS[1] - BOUNDS[0])))
-    inputs = [arrays, first, stride, share, origin, scale]
-    wp.launch(kernel, dim=len(rows), inputs=inputs, outputs=[x, target], device=DEVICE)
+    inputs = [arrays, weights, cells, 0, first, stride, origin, scale]
+    wp.launch(gather, dim=len(rows), inputs=inputs, outputs=[x, target], device=DEVICE)
 
     m = {name: values[first::stride] for name, values in made.items()}
     expected = [(m["position"] - BOUNDS[0]) / (BOUNDS[1] - BOUNDS[0])]
@@ -128,6 +130,28 @@ def test_targets(product, mis_aware, product_cosine, vertex_loss, whole_emission
     if vertex_loss:
         np.testing.assert_allclose(got[:, 4:7], cosine_axis(m), atol=1e-7)
         np.testing.assert_allclose(got[:, 7], m["bsdf_pdf"], rtol=1e-6)
+
+
+def test_brightness():
+    """Weights are divided by the mean weight of the records of their cell so far, of 16 more that have that of all."""
+    R, n = 4, 3000
+    guide = bound(product=False, mis_aware=False, brightness_cells=R, **SMALL)
+    sums, counts = np.zeros(R**3), np.zeros(R**3)
+    batches = []
+    step = guide.model.train_step
+    guide.model.train_step = lambda x, target, **options: batches.append(target.numpy().copy()) or step(x, target, **options)
+    for seed in (1, 2):
+        made = made_records(n, np.random.default_rng(seed))
+        guide.train(records_of(made))
+        weight = made["radiance"].mean(axis=1) / made["pdf"] / made["survival"]
+        index = np.floor((made["position"] - BOUNDS[0]) / (BOUNDS[1] - BOUNDS[0]) * R).astype(int)
+        cell = (index[:, 0] * R + index[:, 1]) * R + index[:, 2]
+        np.add.at(sums, cell, weight)
+        np.add.at(counts, cell, 1.0)
+        mean = (sums + 16.0 * sums.sum() / counts.sum()) / (counts + 16.0)
+        steps = guide.settings.steps_per_spp
+        for k, batch in enumerate(batches[-steps:]):
+            np.testing.assert_allclose(batch[:, 3], (weight / mean[cell])[k::steps], rtol=1e-4)
 
 
 # --- the loss --------------------------------------------------------------------------------------------------------
@@ -275,7 +299,9 @@ def test_a_known_field_is_learned(product, direction):
     for name, array in on_device(learning_records(rng, n)).items():
         setattr(arrays, name, array)
     x, target = guide._batch(n)
-    inputs = [arrays, 0, 1, 0.5, *guide.unit_cube]
+    weights = wp.zeros(n, dtype=wp.float32, device=DEVICE)
+    wp.launch(guide.weigh_records, dim=n, inputs=[arrays, 0.5], outputs=[weights], device=DEVICE)
+    inputs = [arrays, weights, guide.cells, 0, 0, 1, *guide.unit_cube]
     wp.launch(guide.gather_batch, dim=n, inputs=inputs, outputs=[x, target], device=DEVICE)
     wp.copy(guide.model.parameters, guide.model.inference_parameters)
     loss = guide.model.compute_gradients(x, target, guide.kl_loss) * guide.settings.n_outputs
