@@ -292,12 +292,15 @@ class NpmGuide(Guide):
 
     def statistics(self):
         loss = None if math.isnan(self.loss) else self.loss
+        network = self.model.statistics
         return {
             "training_passes": self.passes,
+            "steps": network["steps"],
             "records": self.record_count,
             "loss": loss,
+            "skipped_batches": network["skipped_batches"],
             "parameters": self.model.n_params,
-        } | self.model.statistics
+        }
 
     def query(self, vertex: GuideVertex, directions: np.ndarray) -> np.ndarray:
         s = self.settings

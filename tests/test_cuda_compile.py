@@ -13,6 +13,7 @@ from wavefront.features import Features
 from wavefront.film import FIRST_HIT
 from wavefront.guided import make_guided_kernels
 from wavefront.integrator import make_kernels
+from wavefront.proposals import INPUTS
 from wavefront.recording import FIELDS, make_gather
 from wavefront.stages.inspect import make_inspect_hit, make_inspect_light
 
@@ -125,7 +126,10 @@ def guided_modules(features: Features) -> list:
     kernels = []
     for records in ((), tuple(FIELDS)):
         for guide_pdf in (True, False):
-            guided = dataclasses.replace(features, guide=("any",), guide_pdf=guide_pdf, records=records)
+            inputs = tuple(INPUTS) if records else ()
+            guided = dataclasses.replace(
+                features, guide=("any",), guide_pdf=guide_pdf, guide_inputs=inputs, records=records
+            )
             kernels += [*make_guided_kernels(guided).values(), make_kernels(guided).advance]
     kernels += make_gather(tuple(FIELDS))
     kernels.append(make_kernels(dataclasses.replace(guided, variance=True, weighted=True)).accumulate)

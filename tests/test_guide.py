@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from guiding.npm import NpmGuide, NpmSettings
 from tests.guides import HistogramGuide, LobeGuide, MeanGuide, RampGuide, ResamplingGuide
 from tools.image_test import Comparison, Estimate
 from wavefront import Renderer, WavefrontError, load_scene, renderer
@@ -32,6 +33,13 @@ GUIDES = {
     "resampling 3": lambda: ResamplingGuide(3),
     "resampling 4": lambda: ResamplingGuide(4, from_bsdf=True),
 }
+
+
+def small_npm() -> NpmGuide:
+    """Neural parametric mixtures with a grid of few parameters, all that depends on threads included."""
+    grid = {"n_levels": 2, "n_features": 2, "base_resolution": 4, "per_level_scale": 2.0, "n_neurons": 32}
+    settings = NpmSettings(**grid, product=True, n_lobes=4, train_share=0.5, brightness_cells=4, learned_share=True)
+    return NpmGuide(settings, seed=4)
 
 
 def load(name, *overrides, size=24):
@@ -165,7 +173,7 @@ def test_a_guide_without_records_allocates_none():
 
 
 @pytest.mark.parametrize("nee", ["true", "false"])
-@pytest.mark.parametrize("guide", [HistogramGuide, MeanGuide, lambda: ResamplingGuide(1)])
+@pytest.mark.parametrize("guide", [HistogramGuide, MeanGuide, lambda: ResamplingGuide(1), small_npm])
 def test_bytes_per_path_are_what_is_allocated(guide, nee):
     """The state of the guide itself included."""
     r = Renderer(load("coloured-glass", f"integrator.nee={nee}"), threads=1, guide=guide())
@@ -181,13 +189,14 @@ def test_bytes_per_path_are_what_is_allocated(guide, nee):
 # --- deterministic ---------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module", params=["histogram", "resampling", "mean", "ramp"])
+@pytest.fixture(scope="module", params=["histogram", "resampling", "mean", "ramp", "npm"])
 def make_guide(request):
     return {
         "histogram": HistogramGuide,
         "resampling": lambda: ResamplingGuide(2, from_bsdf=True),
         "mean": lambda: MeanGuide(0.5, one_minus_cos=0.5),
         "ramp": lambda: RampGuide(0.5, one_minus_cos=0.5),
+        "npm": small_npm,
     }[request.param]
 
 

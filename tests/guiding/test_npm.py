@@ -139,7 +139,9 @@ def test_brightness():
     sums, counts = np.zeros(R**3), np.zeros(R**3)
     batches = []
     step = guide.model.train_step
-    guide.model.train_step = lambda x, target, **options: batches.append(target.numpy().copy()) or step(x, target, **options)
+    guide.model.train_step = lambda x, target, **options: (
+        batches.append(target.numpy().copy()) or step(x, target, **options)
+    )
     for seed in (1, 2):
         made = made_records(n, np.random.default_rng(seed))
         guide.train(records_of(made))
