@@ -139,9 +139,12 @@ def test_brightness():
     sums, counts = np.zeros(R**3), np.zeros(R**3)
     batches = []
     step = guide.model.train_step
-    guide.model.train_step = lambda x, target, **options: (
-        batches.append(target.numpy().copy()) or step(x, target, **options)
-    )
+
+    def train_step(x, target, **options):
+        batches.append(target.numpy().copy())
+        return step(x, target, **options)
+
+    guide.model.train_step = train_step
     for seed in (1, 2):
         made = made_records(n, np.random.default_rng(seed))
         guide.train(records_of(made))
