@@ -132,10 +132,10 @@ def lamp_scene(radiance: float = 1e4, scale: float = 1.0) -> d.Scene:
     )
 
 
-def relative_variance(r: Renderer) -> float:
-    """Of the image, by its own estimate."""
+def relative_variance(r: Renderer) -> np.ndarray:
+    """Of each pixel: the expected relMSE, from the film's estimate of its variance."""
     mean = r.film.image().astype(np.float64) @ np.array(LUMINANCE)
-    return float((r.film.variance() / (mean * mean + 1e-4 * (mean * mean).mean())).mean())
+    return r.film.variance() / (mean * mean + 0.01)
 
 
 def lit_floor(r: Renderer, radiance: float, scale: float) -> np.ndarray:
@@ -186,18 +186,20 @@ def test_never_much_worse(name, train_share):
     guided, plain = Renderer(scene, seed=2, guide=npm(product=True, train_share=train_share)), Renderer(scene, seed=2)
     film(guided, 64)
     film(plain, 64)
-    assert relative_variance(guided) < 2.0 * relative_variance(plain)
+    assert relative_variance(guided).mean() < 2.0 * relative_variance(plain).mean()
 
 
 # --- better ----------------------------------------------------------------------------------------------------------
 
 
 def test_the_door():
-    """The room behind a door, training included: at most 0.3 of the relative squared error of an unguided render."""
-    overrides = ("integrator.nee=false", "integrator.rr_depth=null", "integrator.max_depth=11", "film.filter.type=box")
-    scene = load("door-ajar", *overrides, 'film.aovs=["variance"]', size=64)
-    guided = Renderer(scene, seed=1, guide=NpmGuide(NpmSettings(product=True, n_levels=5), seed=1))
-    plain = Renderer(scene, seed=1)
-    film(guided, 128)
-    film(plain, 128)
-    assert relative_variance(guided) < 0.3 * relative_variance(plain)
+    """The room behind a door, training included: at most 0.3 of the relative squared error of an unguided render.
+
+    Measured: 0.17 for these settings, 0.3 without `brightness_cells` and with angles.
+    """
+    scene = load("door-ajar", "integrator.max_depth=11", "integrator.rr_depth=null", 'film.aovs=["variance"]', size=64)
+    settings = NpmSettings(product=True, direction="vector", brightness_cells=16, n_levels=5)
+    guided, plain = Renderer(scene, seed=1, guide=NpmGuide(settings, seed=1)), Renderer(scene, seed=1)
+    film(guided, 256)
+    film(plain, 256)
+    assert relative_variance(guided).mean() < 0.3 * relative_variance(plain).mean()
