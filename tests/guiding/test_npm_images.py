@@ -203,3 +203,14 @@ def test_the_door():
     film(guided, 256)
     film(plain, 256)
     assert relative_variance(guided).mean() < 0.3 * relative_variance(plain).mean()
+
+
+def test_a_learned_share_begins_with_that_of_the_settings():
+    """A network that is not trained answers close to zero, and leaves the share at `bsdf_share`."""
+    guide = npm(product=True, learned_share=True, bsdf_share=0.3, train_share=0.0)
+    r = Renderer(load("cornell-box", "integrator.max_depth=2"), threads=1, guide=guide)
+    film(r, 1)
+    share = r.workers[0].proposals.share.numpy()
+    share = share[share > 0.0]
+    assert share.size > 100
+    np.testing.assert_allclose(share, 0.3, atol=0.05)
