@@ -22,7 +22,9 @@ from tools.methods import load_job
 from tools.reference_store import target_records
 from tools.results import Budget, load_results, read_records
 from tools.setting_cost import Cost
+from tools.summary import Figure
 from tools.sweep import joined_pairs, make_plan, method_name, one_at_a_time
+from tools.trade_report import bias_words
 from wavefront import load_scene
 from wavefront.errors import WavefrontError
 from wavefront.integrator import make_features
@@ -290,6 +292,20 @@ def test_equal_time_and_a_grid(tmp_path, capsys, monkeypatch):
     one, two, both = ([s["seconds"]["mean"] for s in section["settings"]] for section in found["sections"])
     assert (np.minimum(one, two) * 0.5 < both).all() and (both < np.maximum(one, two) * 2.0).all()
     assert "max_depth=2, rr_depth=2" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("bias", "words"),
+    [
+        (None, "?"),
+        (Figure(0.0, 0.0, 0.0), "0"),
+        (Figure(0.5, 0.25, 0.75), "0.5 (0.25 to 0.75)"),
+        (Figure(0.25, -0.25, 0.75), "< 0.75"),
+        (Figure(-0.5, -0.75, -0.25), "none found"),
+    ],
+)
+def test_words_for_a_bias(bias, words):
+    assert bias_words(bias) == words
 
 
 def test_cost_of_a_setting(tmp_path):
