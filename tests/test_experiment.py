@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from tools import experiment, methods
+from tools import results as stored
 from tools.experiment_spec import plan, read_spec
 from tools.methods import load_job
 from tools.metrics import evaluate
@@ -278,6 +279,22 @@ def test_other_settings_are_refused(at_once, tmp_path, capsys):
     assert command(write(tmp_path, seeds=[1, 2, 3, 4, 5]), folder) == 0
     assert (folder / "results.jsonl").read_bytes().startswith(records)
     assert len(load_results(folder).records) == 10
+
+
+def test_runs_of_another_commit_are_told(tmp_path, capsys, monkeypatch):
+    spec, folder = write(tmp_path, budgets=[{"spp": 1}], images="none"), tmp_path / "results"
+    for commit, words in (
+        ("a", ""),
+        ("a", ""),
+        ("b", "another commit, a, are not made again"),
+        (None, "commit, b, are"),
+    ):
+        monkeypatch.setattr(stored, "commit", lambda commit=commit: commit)
+        monkeypatch.setattr(experiment, "commit", stored.commit)
+        assert command(spec, folder) == 0
+        error = capsys.readouterr().err
+        assert words in error
+        assert ("another commit" in error) == bool(words)
 
 
 def test_a_reference_that_is_there_is_used(tmp_path):

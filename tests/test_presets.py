@@ -11,7 +11,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from tools import preset_check, trade
+from tools import preset_check, results, trade
 from tools.frontier import DOMINATED
 from tools.reference_store import target_records
 from wavefront import load_scene, presets
@@ -145,6 +145,11 @@ def test_check_of_presets(tmp_path, monkeypatch, capsys):
     # One that claims to have no bias.
     assert check(tmp_path, monkeypatch, draft=(SETTINGS["draft"][0], [])) == 2
     assert "draft.json: biased_by is empty; cornell-box finds a bias" in capsys.readouterr().err
+    # Runs of other code say nothing of this one.
+    made_by = json.loads((tmp_path / "results" / "experiment.json").read_text())["commit"]
+    monkeypatch.setattr(results, "commit", lambda: "f" * 40)
+    assert check(tmp_path, monkeypatch) == 2
+    assert f"results: has runs of another commit, {made_by}; choose another --output" in capsys.readouterr().err
 
 
 def test_a_preset_that_is_no_knob(tmp_path, monkeypatch, capsys):

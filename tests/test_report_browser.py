@@ -370,6 +370,50 @@ def test_pixel_under_the_mouse(viewer):
 # --- the page ----------------------------------------------------------------------------------------------------
 
 
+def test_table_is_sorted_by_its_headings(browser, tmp_path):
+    """By mouse and keys, within every scene and budget; figures as numbers, and what has none last."""
+    made = write_results(tmp_path / "results", {"room": SCENES["room"]}, ("slow", "fast", "another", "none"))
+    assert report.main([str(made), "--images", "none"]) == 0
+    with opened(browser, made / "report.html") as page:
+        table = page.locator("table.results:visible")
+        page.evaluate("""() => {  // figures that are sorted in another order as text, and one that is not known
+          for (const body of document.querySelectorAll("table.results tbody")) {
+            const cells = [...body.querySelectorAll("[data-name=time]")];
+            ["9", "1e-05", "10.5"].forEach((value, i) => { cells[i].dataset.value = value; });
+            cells[3].removeAttribute("data-value");
+            cells[3].textContent = "";
+          }
+        }""")
+
+        def assert_order(*methods):
+            assert table.locator("tbody th").all_inner_texts() == ["room · 4 spp", *methods, "room · 16 spp", *methods]
+
+        before = ("slow", "fast", "another", "none")
+        assert_order(*before)
+        time = table.get_by_role("button", name="time, s")
+        for order, methods in (
+            ("ascending", ("fast", "slow", "another", "none")),
+            ("descending", ("another", "slow", "fast", "none")),
+            (None, before),
+        ):
+            time.click()
+            assert_order(*methods)
+            assert table.locator("thead th").nth(4).get_attribute("aria-sort") == order
+        time.press("Enter")
+        time.press("Space")
+        assert_order("another", "slow", "fast", "none")
+        page.locator("#metric").select_option("mae")  # the order stays
+        assert_order("another", "slow", "fast", "none")
+        table.get_by_role("button", name="method").click()
+        assert_order("another", "fast", "none", "slow")
+        assert table.locator("[aria-sort]").all_inner_texts() == ["method"]
+        table.get_by_role("button", name="MAE").click()  # those with the same error stay as they were
+        assert_order("fast", "another", "none", "slow")
+        table.get_by_role("button", name="speed-up over slow").click()  # that of the baseline is 1
+        assert_order("slow", "fast", "another", "none")
+        assert table.locator("thead button").count() == 7  # none on the intervals
+
+
 def test_choice_of_the_metric(viewer):
     """The table and the plots change, and so do the captions."""
     assert viewer.page.locator("table.results:visible").count() == 1

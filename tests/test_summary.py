@@ -133,3 +133,7 @@ def test_remarks_name_what_a_reader_must_know():
     text = summary.markdown(made, summarise(made))
     assert text.count("| room | 2 s |") == 2
     assert "| short * |" in text
+    for verdict, words in (("same", []), ("noisy", ["are too noisy to be compared"]), ("differs", ["differ"])):
+        made.experiment.scenes[0].reference.comparisons[:] = [{"verdict": verdict}]
+        found = summary.remarks(made, summarise(made))[len(lines) :]
+        assert found == [f"room: the references of two renderers {word}" for word in words]

@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -22,7 +23,9 @@ from tools.methods import load_job
 from tools.reference_store import target_records
 from tools.results import Budget, load_results, read_records
 from tools.setting_cost import Cost
+from tools.summary import Figure
 from tools.sweep import joined_pairs, make_plan, method_name, one_at_a_time
+from tools.trade_report import bias_words
 from wavefront import load_scene
 from wavefront.errors import WavefrontError
 from wavefront.integrator import make_features
@@ -32,29 +35,39 @@ ROOT = Path(__file__).parent.parent
 CORNELL_BOX = ROOT / "scenes" / "cornell-box.json"
 SMALL = ["film.width=12", "film.height=10", "film.filter.type=box", "integrator.max_depth=4"]
 REFERENCE = ReferenceSpec(error=0.5)
+GUIDED = ["--override", 'integrator.guide={"preset": "npm-product"}']
 VALUES = [(knob, value) for knob in KNOBS.values() for value in knob.values]
 
 
 # --- knobs -------------------------------------------------------------------------------------------------------
 
 
+def guided(knob: Knob) -> list[str]:
+    """What a scene needs to have a knob."""
+    return ['integrator.guide={"preset": "npm-product"}'] if knob.of_guide else []
+
+
 @pytest.mark.parametrize(("knob", "value"), VALUES, ids=[f"{knob.name}={label(value)}" for knob, value in VALUES])
 def test_the_scene_takes_every_value(knob, value):
     for start in ([], ['film.filter={"type": "gaussian", "stddev": 0.7}', "integrator.rr_depth=null"]):
-        scene = load_scene(CORNELL_BOX, [*start, *knob.overrides(value)])
+        scene = load_scene(CORNELL_BOX, [*start, *guided(knob), *knob.overrides(value)])
         assert knob.own(scene) == value
     assert parse_knob(f"{knob.name}={label(value)}") == (knob, (value,))
 
 
 @pytest.mark.parametrize("knob", KNOBS.values(), ids=KNOBS)
 def test_knobs_trade_what_they_say(knob):
-    """A bias is another expected image; kernels and buffers follow from the features."""
+    """A bias is another expected image; kernels and buffers follow from the features and the guide's network."""
     assert set(knob.trades) <= set(TRADES)
-    scenes = [load_scene(CORNELL_BOX, knob.overrides(value)) for value in knob.values]
+    scenes = [load_scene(CORNELL_BOX, [*guided(knob), *knob.overrides(value)]) for value in knob.values]
     targets = [json.dumps(target_records(scene)) for scene in scenes]
     assert (len(set(targets)) > 1) == ("bias" in knob.trades)
-    features = {make_features(scene, upload_scene(scene, "cpu"), guide_of(scene)) for scene in scenes}
-    assert (len(features) > 1) == ("compile" in knob.trades)
+    built = set()
+    for scene in scenes:
+        guide = guide_of(scene)
+        network = guide and (guide.settings.n_outputs, json.dumps(guide.settings.model()))
+        built.add((make_features(scene, upload_scene(scene, "cpu"), guide), network))
+    assert (len(built) > 1) == ("compile" in knob.trades)
 
 
 def test_values_of_the_reference():
@@ -153,6 +166,12 @@ def test_pairs_by_hand():
             "error: --more-spp 4; allowed: more than the largest of --spp",
         ),
         ([CORNELL_BOX, "--metric", "psnr"], "error: --metric psnr; allowed: mse, "),
+        (
+            [CORNELL_BOX, "--knob", "n_neurons"],
+            "error: --knob n_neurons: the scene names no guide; one is chosen as by",
+        ),
+        ([CORNELL_BOX, "--knob", "guide", "--knob", "train_share"], "error: --knob guide together with --knob train"),
+        ([CORNELL_BOX, *GUIDED, "--knob", "n_neurons=48"], "integrator.guide.settings.n_neurons: "),
         ([CORNELL_BOX, "--seeds", "0"], "error: --seeds 0; allowed: 1 to 127"),
         ([CORNELL_BOX, "--rounds", "-1"], "error: --rounds -1; allowed: 0 or more"),
         ([CORNELL_BOX, "--threads", "0"], "error: --threads 0; allowed: 1 or more"),
@@ -292,7 +311,27 @@ def test_equal_time_and_a_grid(tmp_path, capsys, monkeypatch):
     assert "max_depth=2, rr_depth=2" in capsys.readouterr().out
 
 
-def test_cost_of_a_setting(tmp_path):
+@pytest.mark.parametrize(
+    ("bias", "words"),
+    [
+        (None, "?"),
+        (Figure(0.0, 0.0, 0.0), "0"),
+        (Figure(0.5, 0.25, 0.75), "0.5 (0.25 to 0.75)"),
+        (Figure(0.25, -0.25, 0.75), "< 0.75"),
+        (Figure(-0.5, -0.75, -0.25), "none found"),
+    ],
+)
+def test_words_for_a_bias(bias, words):
+    assert bias_words(bias) == words
+
+
+GUIDED_METHODS = [
+    MethodSpec(name=name, overrides=[GUIDED[1], f"integrator.guide.settings.n_neurons={n}"])
+    for name, n in (("narrow", 32), ("wide", 64))
+]
+
+
+def test_cost_of_a_setting(tmp_path, monkeypatch):
     """In a process of its own, once for all settings with the same kernels; the file keeps it."""
     path = tmp_path / "spec"
     spec = Spec(
@@ -309,6 +348,11 @@ def test_cost_of_a_setting(tmp_path):
     assert 50 << 20 < costs["a"].peak_memory_bytes < 4 << 30
     assert setting_cost.measure_all(scene, {"b": "same"}, tmp_path, said.append) == {"b": costs["b"]}
     assert len(said) == 1
+    # Networks are not among the features.
+    monkeypatch.setattr(setting_cost, "measure", fake_cost)
+    (guided_scene,) = plan_experiment(msgspec.structs.replace(spec, methods=GUIDED_METHODS), path)
+    setting_cost.measure_all(guided_scene, {"narrow": "same", "wide": "same"}, tmp_path, said.append)
+    assert said[1:] == [f"cornell-box, {name}: compile time and memory" for name in ("narrow", "wide")]
     (tmp_path / "costs.json").write_text("{")
     with pytest.raises(WavefrontError, match=r"costs.json: damaged"):
         setting_cost.measure_all(scene, {"b": "same"}, tmp_path, said.append)

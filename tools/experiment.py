@@ -55,6 +55,7 @@ from tools.results import (
     appending,
     commit,
     load_results,
+    other_commit,
     read_records,
     slug,
     write_json,
@@ -255,6 +256,8 @@ class Run:
         with appending(self.folder / RECORDS) as file:
             entries = [self._reference(scene) for scene in self.scenes]
             done = self._done()
+            if done and (before := other_commit(self.folder)):
+                self.console.print(f"warning: {self.folder}: runs of another commit, {before}, are not made again")
             write_json(self.folder / EXPERIMENT, self._experiment(entries))
             # Seeds in the outer loop: an experiment that is stopped has some runs of all, and a slow minute of the
             # machine hits all methods alike.

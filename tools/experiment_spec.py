@@ -213,8 +213,9 @@ def expand(file: str, base: Path, where: str, spec_path: Path) -> Path:
     """
     for name in _VARIABLE.findall(file):
         if not os.environ.get(name):
+            inside = file.partition("}")[2].lstrip("/")
             raise SceneError(
-                f"the environment variable {name} is not set; it names the folder of {file.partition('}')[2]}",
+                f"the environment variable {name} is not set; it names the folder of {inside}",
                 spec_path,
                 where,
             )

@@ -11,6 +11,7 @@ import dataclasses
 import json
 from collections.abc import Callable, Sequence
 
+from guiding.registry import plain_settings
 from wavefront.errors import WavefrontError
 from wavefront.scene import description
 from wavefront.scene.lookup import value_at
@@ -36,6 +37,7 @@ class Knob:
             with a bias is measured against it.
         trains: Whether a run that learns is meant, in which fewer samples are not the beginning of more.
         on_request: It is swept only if it is named.
+        of_guide: It is a setting of the guide that the scene names.
     """
 
     name: str
@@ -46,14 +48,27 @@ class Knob:
     least_biased: Callable[[Sequence[Value]], Value] = lambda values: values[0]
     trains: bool = False
     on_request: bool = False
+    of_guide: bool = False
 
     def overrides(self, value: Value) -> list[str]:
         """The changes of a scene that set this value."""
         return [self.override(value) if self.override else f"{self.key}={json.dumps(value)}"]
 
     def own(self, scene: description.Scene) -> Value:
-        """The value that a scene has."""
-        return value_at(scene, self.key)
+        """The value that a scene has.
+
+        Raises:
+            WavefrontError: A setting of a guide, and the scene names none, or one without such a setting.
+        """
+        if not self.of_guide:
+            return value_at(scene, self.key)
+        guide = plain_settings(scene)
+        if guide is None:
+            example = """--override 'integrator.guide={"preset": "npm-product"}'"""
+            raise WavefrontError(f"--knob {self.name}: the scene names no guide; one is chosen as by {example}")
+        if self.name not in guide["settings"]:
+            raise WavefrontError(f"--knob {self.name}: {guide['method']} has no such setting")
+        return guide["settings"][self.name]
 
 
 def _filter(value: Value) -> str:
@@ -62,6 +77,11 @@ def _filter(value: Value) -> str:
 
 def _guide(value: Value) -> str:
     return f"integrator.guide={json.dumps(None if value is None else {'preset': value})}"
+
+
+def _of_guide(name: str, values: tuple[Value, ...], trades: tuple[str, ...], key: str | None = None) -> Knob:
+    key = key or f"integrator.guide.settings.{name}"
+    return Knob(name, key, values, trades, trains=True, on_request=True, of_guide=True)
 
 
 def _longest(depths: Sequence[Value]) -> Value:
@@ -86,6 +106,10 @@ KNOBS: dict[str, Knob] = {
             trains=True,
             on_request=True,
         ),
+        _of_guide("train_share", (0.1, 0.25, 0.5), ("time", "variance"), "integrator.guide.train_share"),
+        _of_guide("n_lobes", (4, 8, 16), ("time", "variance", "memory", "compile")),
+        _of_guide("n_neurons", (32, 64, 128), ("time", "variance", "memory", "compile")),
+        _of_guide("precision", ("fp32", "fp16", "bf16"), ("time", "variance", "compile")),
     )
 }
 

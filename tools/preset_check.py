@@ -5,7 +5,8 @@ methods; where a preset says nothing, a scene's own setting is the unrestricted 
 dominates it (`tools.frontier`) in the geometric means of time and error over all scenes. A preset that promises no bias
 is compared with settings that have none: a little bias is always less error for a while.
 
-With `--update-presets`, the figures, the frontier, the machine and the commit are written to the presets' files.
+A folder that has runs already is gone on with if they are of the same commit, and refused otherwise. With
+`--update-presets`, the figures, the frontier, the machine and the commit are written to the presets' files.
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ from rich.table import Table
 from tools.bench_common import ROOT
 from tools.frontier import DOMINATED, FRONTIER, Setting, Verdict
 from tools.knobs import KNOBS, SPP, UNRESTRICTED_DEPTH
+from tools.metrics import METRICS
 from tools.reference import available_cores
-from tools.results import Results, write_json
+from tools.results import Results, other_commit, write_json
 from tools.summary import mean_figure
 from tools.sweep import Changes, Plan, Section, Sweep, make_plan, method_name, same
 from wavefront.errors import WavefrontError
@@ -133,7 +135,7 @@ def table(checked: list[Checked]) -> Table:
     view = Table(title="presets, geometric means over the scenes", title_justify="left")
     view.add_column("preset")
     view.add_column("setting")
-    for name in ("time, s (95 % interval)", f"{METRIC} (95 % interval)"):
+    for name in ("time, s (95 % interval)", f"{METRICS[METRIC].label} (95 % interval)"):
         view.add_column(name, justify="right")
     view.add_column("of all scenes")
     view.add_column("of each")
@@ -215,6 +217,8 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
         more=most,
     )
     folder = arguments.output or Path("results") / "presets"
+    if before := other_commit(folder):
+        raise WavefrontError(f"{folder}: has runs of another commit, {before}; choose another --output or remove it")
     sweep = Sweep(
         plan,
         "presets",

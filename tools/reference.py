@@ -225,7 +225,8 @@ def in_words(outcome: dict) -> str:
     """A comparison in one line."""
     first, second = outcome["images"]
     rows, columns = outcome["tiles"]
-    text = f"{outcome['verdict']}: {first} against {second}: "
+    verdict = "too noisy to be compared" if outcome["verdict"] == "noisy" else outcome["verdict"]
+    text = f"{verdict}: {first} against {second}: "
     if outcome["ratio_of_means"] is not None:
         low, high = outcome["ratio_interval_95"]
         text += f"ratio of means {outcome['ratio_of_means']:.4f}, 95 % interval {low:.4f} to {high:.4f}; "

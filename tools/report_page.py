@@ -110,7 +110,7 @@ def make_page(
         setup=_setup(results),
         footer=_footer(bool(scenes), images),
         style=_part("report.css"),
-        script="\n".join(map(_part, ("pixels.js", "viewer.js", "controls.js"))),
+        script="\n".join(map(_part, ("pixels.js", "viewer.js", "table.js", "controls.js"))),
         # In a script element, only "<" could end it.
         data=msgspec.json.encode(data).decode("utf-8").replace("<", "\\u003c"),
         pixels="\n".join(pixels.elements),

@@ -340,3 +340,10 @@ def commit() -> str | None:
     except OSError:
         return None
     return done.stdout.strip() or None
+
+
+def other_commit(folder: Path) -> str | None:
+    """The commit that the runs of a folder are of, if it is another than now; None if not, and where there are none."""
+    now = commit()
+    before = load_results(folder).experiment.commit if (folder / EXPERIMENT).exists() else now
+    return None if before == now else before or "unknown"

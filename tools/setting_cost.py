@@ -14,6 +14,7 @@ from pathlib import Path
 
 import msgspec
 
+from guiding.registry import plain_settings
 from tools.bench_common import Child, peak_memory_bytes, serve
 from tools.experiment_spec import PlannedScene
 from tools.methods import RENDERERS
@@ -45,7 +46,8 @@ def measure(job: dict) -> Cost:
 def measure_all(
     scene: PlannedScene, features: dict[str, str], folder: Path, progress: Callable[[str], object]
 ) -> dict[str, Cost]:
-    """The costs of all methods on a scene, measured once for those with the same kernels and kept in ``costs.json``.
+    """The costs of all methods on a scene, kept in ``costs.json``; measured once for those with the same kernels and
+    the same guide, whose settings say what its network is like.
 
     Args:
         scene: Planned, with a job for each method.
@@ -66,7 +68,9 @@ def measure_all(
         job = scene.jobs[name]
         film = job.scene.film
         versions = RENDERERS["wavefront"].versions(job.device)
-        key = scene_hash([scene.name, film.width, film.height, digest, job.threads, job.device, versions])
+        guide = plain_settings(job.scene)
+        parts = [scene.name, film.width, film.height, digest, job.threads, job.device, versions]
+        key = scene_hash([*parts, guide] if guide else parts)
         if key not in known:
             progress(f"{scene.name}, {name}: compile time and memory")
             request = {"scene": str(job.path), "overrides": job.overrides, "parameters": dict(job.parameters)}

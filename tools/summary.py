@@ -21,6 +21,7 @@ import numpy as np
 from rich.table import Table
 
 from tools.bench_common import require_scipy
+from tools.metrics import METRICS
 from tools.results import Budget, Record, Results
 
 CONFIDENCE = 0.95
@@ -189,8 +190,8 @@ def summarise(results: Results) -> list[Cell]:
 
 
 def _columns(results: Results) -> list[str]:
-    metric, baseline = results.experiment.metrics[0], results.experiment.baseline
-    columns = ["scene", "budget", "method", "runs", f"{metric} (95 % interval)", "time, s", "spp", "efficiency"]
+    error, baseline = METRICS[results.experiment.metrics[0]].label, results.experiment.baseline
+    columns = ["scene", "budget", "method", "runs", f"{error} (95 % interval)", "time, s", "spp", "efficiency"]
     return columns + ([f"speed-up over {baseline} (95 % interval)"] if baseline else [])
 
 
@@ -206,7 +207,8 @@ def _cells(cell: Cell, metric: str, baseline: str | None) -> list[str]:
 def table(results: Results, cells: Sequence[Cell]) -> Table:
     """The summary by the first metric, for a terminal."""
     experiment = results.experiment
-    title = f"{experiment.name}: {experiment.threads} threads, {experiment.machine['cpu']}"
+    threads = f"{experiment.threads} thread{'s' * (experiment.threads != 1)}"
+    title = f"{experiment.name}: {threads}, {experiment.machine['cpu']}"
     view = Table(title=title, title_justify="left")
     for i, name in enumerate(_columns(results)):
         view.add_column(name, justify="left" if i < 3 else "right")
@@ -246,5 +248,7 @@ def remarks(results: Results, cells: Sequence[Cell]) -> list[str]:
             )
         for comparison in scene.reference.comparisons:
             if comparison["verdict"] != "same":
-                lines.append(f"{scene.name}: references of two renderers: {comparison['verdict']}")
+                noisy = comparison["verdict"] == "noisy"
+                words = "are too noisy to be compared" if noisy else "differ"
+                lines.append(f"{scene.name}: the references of two renderers {words}")
     return lines

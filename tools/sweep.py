@@ -120,6 +120,9 @@ def make_plan(
         WavefrontError: A scene that cannot be read, a value that it refuses, or scenes that do not have the same
             settings to start from.
     """
+    of_guide = [name for name in knobs if KNOBS[name].of_guide]
+    if of_guide and "guide" in knobs:
+        raise WavefrontError(f"--knob guide together with --knob {of_guide[0]}, which is a setting of one guide")
     jobs = [load_job(Path(path), overrides, parameters, 1) for path in paths]
     own: Changes = {}
     for name in knobs:

@@ -2,8 +2,8 @@
 
     python -m tools.trade SCENE [--knob NAME[=v1,v2,...] ...] [--spp N,N,... | --seconds S,S,...] [--output FOLDER]
 
-Every knob (`tools.knobs`; by default all of them but the guide) is turned on its own, from the scene's settings; then
-what is on the Pareto frontier of time against error is joined in pairs (`--rounds`), or all combinations are taken
+Every knob (`tools.knobs`; by default all of them but those of guides) is turned on its own, from the scene's settings;
+then what is on the Pareto frontier of time against error is joined in pairs (`--rounds`), or all combinations are taken
 (`--grid`). Each setting is rendered with several seeds. The report names the settings on the frontier, those that are
 *dominated* (another setting takes less time and has less error, and the runs allow to say so), and those that are not
 separated.
@@ -75,7 +75,7 @@ def build_parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar="NAME[=v1,v2,...]",
-        help=f"which to turn, and to what; of {', '.join(KNOBS)}; default: all but guide",
+        help=f"which to turn, and to what; of {', '.join(KNOBS)}; default: all but those of guides",
     )
     parser.add_argument("--grid", action="store_true", help="all combinations of the values")
     parser.add_argument("--rounds", type=int, default=1, metavar="N", help="of joining pairs; default 1")

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from tools.frontier import DOMINATED, FALSE_ALARM_RATE, FRONTIER, OPEN, Setting, Verdict
 from tools.knobs import KNOBS, SPP, label
+from tools.metrics import METRICS
 from tools.results import Results
 from tools.summary import NOISY_REFERENCE, Figure, mean_figure, ratio_figure
 from tools.sweep import DEFAULT, Plan, Section, Sweep
@@ -28,11 +29,11 @@ def bias_share(section: Section, setting: Setting) -> float | None:
 
 
 def bias_words(bias: Figure | None) -> str:
-    """A bias in a table: none if its interval has 0, and then what it is at most."""
+    """A bias in a table: if its interval has 0, what it is at most; none if chance puts all of the interval below."""
     if bias is None:
         return "?"
-    if bias.high == 0.0:
-        return "0"
+    if bias.high <= 0.0:
+        return "0" if bias.high == 0.0 else "none found"
     return f"< {bias.high:.2g}" if bias.low <= 0.0 else str(bias)
 
 
@@ -40,7 +41,8 @@ def frontier_table(section: Section, metric: str) -> Table:
     """The settings on the frontier, by time; and those on the frontier of the settings without bias, with a mark."""
     table = Table(title=f"{section.name}: the frontier, and * that without bias", title_justify="left")
     table.add_column("setting")
-    columns = ["time, s (95 % interval)", f"{metric} (95 % interval)"] + ["of it bias"] * bool(section.biases)
+    columns = ["time, s (95 % interval)", f"{METRICS[metric].label} (95 % interval)"]
+    columns += ["of it bias"] * bool(section.biases)
     for name in columns:
         table.add_column(name, justify="right")
     table.add_column("")
@@ -75,8 +77,9 @@ def methods_table(section: Section, plan: Plan) -> Table:
     budget = plan.budgets[-1]
     table = Table(title=f"{section.name}: at {budget.label}, over {DEFAULT}", title_justify="left")
     table.add_column("method")
-    columns = ["time (95 % interval)", f"{plan.metric} (95 % interval)"]
-    columns += [f"bias of {plan.metric}"] * bool(section.biases)
+    metric = METRICS[plan.metric].label
+    columns = ["time (95 % interval)", f"{metric} (95 % interval)"]
+    columns += [f"bias of {metric}"] * bool(section.biases)
     columns += ["compile, s", "memory, MiB"] * bool(section.costs)
     for name in [*columns, FRONTIER, OPEN, DOMINATED]:
         table.add_column(name, justify="right")
@@ -118,7 +121,7 @@ def remarks(sections: list[Section], sweep: Sweep, results: Results) -> list[str
         share = scene.reference.error**2 / min(float(np.mean(s.errors)) for s in section.settings)
         if plan.metric == "relmse" and share > NOISY_REFERENCE:
             lines.append(
-                f"{scene.name}: up to {100.0 * min(share, 1.0):.0f} % of a {plan.metric} is the noise of the reference "
+                f"{scene.name}: up to {100.0 * min(share, 1.0):.0f} % of a relMSE is the noise of the reference "
                 f"(relative standard error {scene.reference.error:.2g})"
             )
         for method, bias in section.biases.items():
@@ -252,7 +255,7 @@ def _plot_section(axis, section: Section, metric: str) -> None:
             zorder=3 if verdict.kind == FRONTIER else 2,
         )
         named.add(called)
-    axis.set(xscale="log", yscale="log", xlabel="time, s", ylabel=metric, title=section.name)
+    axis.set(xscale="log", yscale="log", xlabel="time, s", ylabel=METRICS[metric].label, title=section.name)
     axis.grid(True, which="both", linewidth=0.3)
     title = "circle: on the frontier\nsquare: not separated\ncross: dominated"
     axis.legend(fontsize=7, title=title, title_fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))

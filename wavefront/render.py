@@ -266,7 +266,9 @@ def run_with_progress(
         TimeRemainingColumn(),
         *([TextColumn("{task.fields[guide]}", markup=False)] if renderer.guide else []),
     )
-    film, workers = renderer.film, f" with {renderer.threads} threads" if renderer.device == "cpu" else ""
+    film, workers = renderer.film, ""
+    if renderer.device == "cpu":
+        workers = f" with {renderer.threads} thread{'s' * (renderer.threads != 1)}"
     with Interrupt(console) as interrupt, Progress(*columns, console=console) as progress:
         console.print(
             f"rendering {film.width}x{film.height} on {renderer.device}{workers}; {renderer.bytes_per_pixel} bytes per "

@@ -221,6 +221,7 @@ function button(group, value, attributes, ...content) {
 }
 
 function start() {
+  sortable();
   $("metric").addEventListener("change", (event) => showMetric(event.target.value));
   root.hidden = data.scenes.length === 0;
   showMetric(data.shown);

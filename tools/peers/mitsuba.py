@@ -32,7 +32,7 @@ def require():
     try:
         import mitsuba
     except ImportError as error:
-        raise WavefrontError(f"Mitsuba is not installed ({error}); pip install 'wavefront[mitsuba]'") from None
+        raise WavefrontError(f"Mitsuba is not installed ({error}); it comes with pip install '.[mitsuba]'") from None
     return mitsuba
 
 
