@@ -78,6 +78,7 @@ CHANGES = [
     {"bsdfs": ("dielectric",), "aovs": ("albedo",), "variance": False},
     {"camera": "thin_lens", "sampler": "sobol"},
     {"camera": "orthographic", "aovs": ("shape_index",)},
+    {"camera": "spherical"},
 ]
 
 
