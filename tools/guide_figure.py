@@ -28,6 +28,7 @@ def need_matplotlib() -> None:
 def write_figure(
     path: Path,
     title: str,
+    image_title: str,
     image: np.ndarray,
     pixel: tuple[float, float],
     radiance: np.ndarray,
@@ -41,7 +42,8 @@ def write_figure(
     Args:
         path: The file.
         title: Above all.
-        image: The render, linear, [height, width, 3].
+        image_title: Of the image.
+        image: With the pixel in it, linear, [height, width, 3].
         pixel: Column and row of the pixel in it.
         radiance: What arrives, linear, [rows, columns, 3].
         densities: Three by their titles, [rows, columns], per steradian, in one logarithmic scale of colours.
@@ -65,7 +67,7 @@ def write_figure(
     axes[0, 0].imshow(tone_map(image, exposure))
     axes[0, 0].plot(*pixel, "o", markersize=11, markerfacecolor="none", markeredgecolor="black", markeredgewidth=3.0)
     axes[0, 0].plot(*pixel, "o", markersize=11, markerfacecolor="none", markeredgecolor="white", markeredgewidth=1.2)
-    axes[0, 0].set_title("the pixel")
+    axes[0, 0].set_title(f"{image_title}, and the pixel")
     axes[0, 0].set_axis_off()
 
     on_map = {"extent": (-180.0, 180.0, -90.0, 90.0), "interpolation": "nearest"}

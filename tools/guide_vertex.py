@@ -24,9 +24,10 @@ WITHOUT_EXTENT = (description.Directional, description.Point, description.Spot)
 
 
 def centred(scene: description.Scene) -> description.Scene:
-    """The scene as it is traced from: unguided, without Russian roulette, camera rays through the centres of pixels."""
+    """The scene as it is traced from: unguided, without Russian roulette, camera rays through the centres of pixels;
+    with the albedo as an AOV."""
     replace = msgspec.structs.replace
-    film = replace(scene.film, filter=description.TentFilter(radius=1e-6), aovs=[])  # below float32's resolution
+    film = replace(scene.film, filter=description.TentFilter(radius=1e-6), aovs=["albedo"])  # too narrow for float32
     return replace(scene, film=film, integrator=replace(scene.integrator, guide=None, rr_depth=None))
 
 

@@ -42,7 +42,6 @@ from wavefront.render import (
 from wavefront.scene import Scene
 from wavefront.scene.images import replacing, write_exr
 
-PREVIEW_SPP = 4  # of the picture, where nothing is learned and so nothing rendered
 LARGEST_MAP = 4096
 TARGET_WORDS = {RADIANCE: "Li", RADIANCE_COSINE: "Li |cos|", PRODUCT: "f Li |cos|"}
 
@@ -251,7 +250,8 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
         return EXIT_SIGNAL + interrupted
     spp = scene.integrator.spp if image is not None else None
     if image is None:
-        image = tracer.render(spp=PREVIEW_SPP)
+        tracer.render(spp=1)
+        image = np.stack([tracer.film.channels()[f"albedo.{c}"] for c in "RGB"], axis=-1)
     directions = DirectionMap(*arguments.grid)
     say(f"tracing {directions.width * directions.height * arguments.rays:,} paths from the vertex")
 
@@ -262,7 +262,11 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
     maps, numbers = compare(guide, worker, vertex, directions, halves)
 
     kl, t = numbers["kl"], vertex.traced
-    noise = "" if numbers["kl_noise"] is None else f"; of each, noise of the traced light: {numbers['kl_noise']:.3f}"
+    noise = (
+        ""
+        if numbers["kl_noise"] is None
+        else f"; of each, noise of the traced light: {max(numbers['kl_noise'], 0.0):.3f}"
+    )
     result = (
         f"KL of {TARGET_WORDS[guide.target]} from the guide {kl['learned']:.3f} nats, from BSDF sampling "
         f"{kl['bsdf']:.3f}, from both at a BSDF share of {numbers['bsdf_share']:.3g} {kl['mixture']:.3f}{noise}"
@@ -280,6 +284,7 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
     write_figure(
         figure_path,
         f"{where}\n{in_words(guide)}\n{result}",
+        "render" if spp is not None else "albedo",
         image,
         (arguments.pixel[0] - window.x, arguments.pixel[1] - window.y),
         np.stack([maps[c] for c in "RGB"], axis=-1),
