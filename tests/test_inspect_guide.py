@@ -77,6 +77,7 @@ def test_excess_of_noise():
 GRID = DirectionMap(32, 48)
 VIEW = [d.TransformStep(look_at=d.LookAt(origin=(0.0, 3.0, 3.0), target=(0.0, 0.0, 0.0)))]
 LEVEL = [d.TransformStep(rotate=d.Rotate(axis=(1.0, 0.0, 0.0), angle=-90.0)), d.TransformStep(scale=5.0)]
+TURNED = [*LEVEL, d.TransformStep(rotate=d.Rotate(axis=(0.0, 0.0, 1.0), angle=180.0))]
 TILTED = [*LEVEL, d.TransformStep(rotate=d.Rotate(axis=(0.3, 0.1, 1.0), angle=37.0))]
 
 
@@ -169,13 +170,29 @@ def test_light_from_behind_a_surface_that_transmits():
     assert numbers["kl"]["learned"] == pytest.approx(LOG2 - 0.5, abs=5e-3)
 
 
-def test_light_through_a_medium():
-    """A lamp 2 m above, in a medium that absorbs: exp(-sigma_a d) of its radiance."""
+def test_a_plate_seen_from_behind():
+    """Its other side counts: what is above, as for one that is seen from its front."""
+    scene = plate(d.TwoSided(front=d.Diffuse(reflectance=1.0)), TURNED)
+    vertex, maps, numbers = compared(scene, lobe("product", 1.0))
+    np.testing.assert_allclose(vertex.asked.normal, (0.0, -1.0, 0.0), atol=1e-6)
+    np.testing.assert_allclose(vertex.front, (0.0, 1.0, 0.0), atol=1e-6)
+    np.testing.assert_allclose(maps["R"], np.repeat([1.0, 0.0], 24)[:, None] * np.ones((1, 32)), atol=1e-6)
+    assert numbers["kl"]["learned"] == pytest.approx(LOG2 - 0.5, abs=5e-3)
+
+
+@pytest.mark.parametrize("bounds", ["nothing", "in front", "behind"])
+def test_light_through_a_medium(bounds):
+    """A lamp 2 m above, in a medium that absorbs: exp(-sigma_a d) of its radiance. The plate may be what bounds it."""
     lamp = d.Sphere(center=(0.0, 2.0, 0.0), radius=1.0, emitter=d.Area(radiance=5.0))
     fog = d.Homogeneous(sigma_a=(0.5, 1.0, 0.0))
     view = {"shapes": [lamp], "emitters": [], "integrator": d.PathIntegrator(max_depth=2)}
     scene = plate(d.Diffuse(), medium=fog, **view)
     scene.camera.to_world = [d.TransformStep(look_at=d.LookAt(origin=(3.0, 1.0, 0.0), target=(0.0, 0.0, 0.0)))]
+    if bounds == "in front":
+        scene.shapes[0].exterior = fog
+    if bounds == "behind":
+        scene.shapes[0].interior = fog
+        scene.shapes[0].bsdf, scene.shapes[0].to_world = d.TwoSided(front=d.Diffuse()), TURNED
     _, maps, _ = compared(scene, lobe("product"))
     zenith = [maps[c][0].mean() for c in "RGB"]
     # The cap of the first row is hardly any farther.
@@ -192,8 +209,12 @@ def test_a_vertex_behind_a_mirror():
     scene = plate(d.Diffuse(), shapes=[mirror], integrator=d.PathIntegrator(max_depth=3))
     view = d.LookAt(origin=(0.0, 1.0, 1.0), target=(0.0, 0.5, -1.0))
     scene.camera.to_world = [d.TransformStep(look_at=view)]
-    vertex = found(scene)[1]
+    _, vertex, halves = found(scene)
     assert vertex.traced.depth == 2
+    # In the mirror, 13 degrees above the level, the sky is two segments away, and the path has one left.
+    assert halves[0][0].radiance[20, 15, 0] == 0.0
+    scene.integrator.max_depth = 4
+    assert found(scene)[2][0][0].radiance[20, 15, 0] == pytest.approx(1.0)
     np.testing.assert_allclose(vertex.asked.position, (0.0, 0.0, 1.0), atol=1e-5)
     scene.integrator.max_depth = 2
     with pytest.raises(WavefrontError, match=r"pixel 4,4 has no vertex 1: .*, and ends with: the longest path"):

@@ -75,12 +75,13 @@ def write_figure(
     axes[0, 1].imshow(np.where(visible[..., None], seen, seen // 2 + 64), **on_map)
     axes[0, 1].set_title("traced incident radiance")
 
-    top = max(float(values.max()) for values in densities.values())
+    # Single cells of a noisy target would darken all the rest.
+    top = max(float(np.quantile(values, 0.999)) for values in densities.values())
     norm = LogNorm(vmin=top * 10.0**-DECADES, vmax=top)
     colours = colormaps["inferno"].with_extremes(bad="0.5")
     drawn = (axes[0, 2], axes[1, 0], axes[1, 1])
     for panel, (name, values) in zip(drawn, densities.items(), strict=True):
-        shown = np.where(values > 0.0, np.maximum(values, norm.vmin), np.nan)
+        shown = np.where(values > 0.0, np.clip(values, norm.vmin, norm.vmax), np.nan)
         mappable = panel.imshow(shown, norm=norm, cmap=colours, **on_map)
         panel.set_title(_plain(name))
     canvas.colorbar(mappable, ax=list(axes[:, 2]), label="density, 1/sr; grey: zero", shrink=0.45, anchor=(0.0, 1.0))

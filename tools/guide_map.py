@@ -75,6 +75,7 @@ class DirectionMap:
 
         The entropy of what is noisy is too low by a term that falls as one over the number of samples (Miller 1955,
         "Note on the bias of information estimates"), so that half of the samples have twice of it.
+        Of few samples it is more than this says.
 
         Args:
             both, halves: The density of the target by all samples, and by either half of them; None for one that is

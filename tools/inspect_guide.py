@@ -265,7 +265,7 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
     noise = (
         ""
         if numbers["kl_noise"] is None
-        else f"; of each, noise of the traced light: {max(numbers['kl_noise'], 0.0):.3f}"
+        else f"; of each at least {max(numbers['kl_noise'], 0.0):.3f} is noise of the traced light"
     )
     result = (
         f"KL of {TARGET_WORDS[guide.target]} from the guide {kl['learned']:.3f} nats, from BSDF sampling "
