@@ -228,11 +228,13 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
     def say(message: str) -> None:
         console.print(message, markup=False, highlight=False, soft_wrap=True)
 
+    def warn(message: str) -> None:
+        say(f"warning: {message}")
+
     check(arguments)
     need_matplotlib()
     output = Path(arguments.output or f"{Path(arguments.scene).stem}-guide.exr")
     check_image_path(output)
-    warn = lambda message: say(f"warning: {message}")  # noqa: E731
     scene = load_scene(arguments.scene, overrides_from(arguments), definitions_from(arguments), warn)
     check_not_read(output_paths(output), arguments.scene, scene)
     guide = make_guide(scene, arguments)
@@ -243,6 +245,8 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
         raise WavefrontError(f"guide {guide.name}: it has no density to ask for")
 
     tracer = make_renderer(arguments, centred(scene), None, console)
+    for note in tracer.device_scene.notes:
+        warn(note)
     worker = VertexWorker(tracer)
     vertex = worker.find(*arguments.pixel, arguments.vertex)
     image, interrupted = learned(guide, arguments, scene, console)
@@ -262,11 +266,9 @@ def run(arguments: argparse.Namespace, console: Console) -> int:
     maps, numbers = compare(guide, worker, vertex, directions, halves)
 
     kl, t = numbers["kl"], vertex.traced
-    noise = (
-        ""
-        if numbers["kl_noise"] is None
-        else f"; of each at least {max(numbers['kl_noise'], 0.0):.3f} is noise of the traced light"
-    )
+    noise = ""
+    if numbers["kl_noise"] is not None:
+        noise = f"; of each at least {max(numbers['kl_noise'], 0.0):.3f} is noise of the traced light"
     result = (
         f"KL of {TARGET_WORDS[guide.target]} from the guide {kl['learned']:.3f} nats, from BSDF sampling "
         f"{kl['bsdf']:.3f}, from both at a BSDF share of {numbers['bsdf_share']:.3g} {kl['mixture']:.3f}{noise}"
