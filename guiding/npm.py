@@ -27,7 +27,16 @@ import warp as wp
 from guiding import npm_kernels
 from guiding.distributions.vmf_mixture import DIRECTIONS, make_vmf_mixture
 from nn import Model
-from wavefront.guide import MIN_SAMPLE_WEIGHT, Guide, GuideContext, GuideState, GuideVertex
+from wavefront.guide import (
+    MIN_SAMPLE_WEIGHT,
+    PRODUCT,
+    RADIANCE,
+    RADIANCE_COSINE,
+    Guide,
+    GuideContext,
+    GuideState,
+    GuideVertex,
+)
 from wavefront.queues import Queue
 from wavefront.recording import RecordArrays, RecordRequest, Records
 
@@ -178,6 +187,7 @@ class NpmGuide(Guide):
     def __init__(self, settings: NpmSettings, seed: int = 0):
         s = self.settings = settings
         self.seed, self.bsdf_share, self.weighted = seed, s.bsdf_share, s.sample_weighting
+        self.target = PRODUCT if s.product else RADIANCE_COSINE if s.cosine_aware else RADIANCE
         self.mixture = make_vmf_mixture(s.n_lobes, s.direction)
         self.key = (s.product, s.cosine_aware, s.learned_share, s.n_lobes, s.direction)
         self.inputs = ("transmits", *(("roughness",) if s.product else ()))

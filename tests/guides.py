@@ -396,6 +396,10 @@ class LobeGuide(Guide):
     def make_state(self, context):
         return LobeState(self, context)
 
+    def query(self, vertex, directions):
+        inside = directions @ np.array(self.axis) >= 1.0 - self.one_minus_cos
+        return np.where(inside, 1.0 / (2.0 * np.pi * self.one_minus_cos), 0.0).astype(np.float32)
+
     def identity(self):
         return {"axis": list(self.axis), "one_minus_cos": self.one_minus_cos, "bsdf_share": self.bsdf_share}
 

@@ -33,8 +33,8 @@ from wavefront.warp_samples import square_to_gaussian, square_to_tent
 
 TEXTURES = ("bytes", "checkerboard", "floats")
 BOX, TENT, GAUSSIAN = wp.constant(0), wp.constant(1), wp.constant(2)
-CAMERAS = ("perspective", "thin_lens", "orthographic")
-THIN_LENS, ORTHOGRAPHIC = wp.constant(1), wp.constant(2)
+CAMERAS = ("perspective", "thin_lens", "orthographic", "spherical")
+THIN_LENS, ORTHOGRAPHIC, SPHERICAL = wp.constant(1), wp.constant(2), wp.constant(3)
 FILTERS = {"box": 0, "tent": 1, "gaussian": 2}
 
 
@@ -77,7 +77,7 @@ def make_megakernel(
     sampler: str,
 ):
     """Only what a scene lacks memory for is left out: kinds of primitive, vertex normals, UVs, tables of sampling."""
-    perspective, thin_lens, orthographic = (make_camera_ray(kind) for kind in CAMERAS)
+    perspective, thin_lens, orthographic, spherical = (make_camera_ray(kind) for kind in CAMERAS)
     closest_hit, occluded = make_intersector(triangles, spheres, instances)
     vertex_of = make_vertex(triangles, spheres, smooth, uvs, tangents, maps, instances)
     eval_bsdf, sample_bsdf, _ = make_bsdf(tuple(sorted(BSDF_KINDS)), True, TEXTURES, tangents, maps)
@@ -119,6 +119,8 @@ def make_megakernel(
             ray = thin_lens(camera, x, y, wp.vec2(u[2], u[3]))
         if settings.camera == ORTHOGRAPHIC:
             ray = orthographic(camera, x, y, wp.vec2(u[2], u[3]))
+        if settings.camera == SPHERICAL:
+            ray = spherical(camera, x, y, wp.vec2(u[2], u[3]))
         origin = ray.origin
         direction = ray.direction
 

@@ -15,7 +15,7 @@ from wavefront.guided import make_guided_kernels
 from wavefront.integrator import make_kernels
 from wavefront.proposals import INPUTS
 from wavefront.recording import FIELDS, make_gather
-from wavefront.stages.inspect import make_inspect_hit, make_inspect_light
+from wavefront.stages.inspect import make_inspect_bsdf, make_inspect_hit, make_inspect_light
 
 CORNELL_BOX = Features(
     triangles=True,
@@ -79,6 +79,7 @@ CHANGES = [
     {"bsdfs": ("dielectric",), "aovs": ("albedo",), "variance": False},
     {"camera": "thin_lens", "sampler": "sobol"},
     {"camera": "orthographic", "aovs": ("shape_index",)},
+    {"camera": "spherical"},
 ]
 
 
@@ -89,7 +90,10 @@ def compile_for_cuda(features: Features, arch: int, folder) -> int:
 
 def inspectors(f: Features) -> list:
     """Modules of the kernels of a traced path."""
-    kernels = [make_inspect_hit(f.triangles, f.spheres, f.instances)]
+    kernels = [
+        make_inspect_hit(f.triangles, f.spheres, f.instances),
+        make_inspect_bsdf(f.bsdfs, f.mask, f.textures, f.uvs, f.tangents, f.maps),
+    ]
     if f.light_sampling:
         kernels.append(make_inspect_light(f.lights, f.light_textures, f.sampler))
     return [kernel.module for kernel in kernels]
@@ -112,7 +116,7 @@ def test_one_feature_set_compiles_for_cuda(tmp_path):
 
 
 def test_kernels_of_a_traced_path_compile_for_cuda(tmp_path):
-    assert compile_modules(inspectors(CORNELL_BOX), 90, tmp_path) == built(tmp_path) == 2
+    assert compile_modules(inspectors(CORNELL_BOX), 90, tmp_path) == built(tmp_path) == 3
 
 
 def test_kernels_that_draw_sobol_points_compile_for_cuda(tmp_path):

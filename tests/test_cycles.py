@@ -138,6 +138,7 @@ def test_lights_without_next_event_estimation(tmp_path):
         ({"shapes": [d.Cube(bsdf=d.Conductor(eta=d.Checkerboard(), k=1.0))]}, "shapes[0].bsdf.eta: with cycles: a"),
         ({"camera": d.Perspective(to_world=[d.TransformStep(scale=(1.0, 2.0, 1.0))])}, "camera.to_world: with cycles"),
         ({"camera": d.Perspective(medium=d.Homogeneous())}, "camera.medium: with cycles: none"),
+        ({"camera": d.Spherical()}, "camera.type: spherical; with cycles: perspective, thin_lens, orthographic"),
     ],
 )
 def test_what_cycles_has_not(fields, message):

@@ -65,6 +65,7 @@ LOOK = [d.TransformStep(look_at=d.LookAt(origin=(0.2, 1.0, 4.2), target=(0.0, 1.
 CAMERAS = {
     "thin lens": d.ThinLens(fov=38.0, aperture_radius=0.2, focus_distance=3.5, to_world=LOOK),
     "orthographic": d.Orthographic(width=2.4, to_world=LOOK),
+    "spherical": d.Spherical(to_world=LOOK),
 }
 
 

@@ -18,7 +18,8 @@ class Camera:
     """World-space vectors of any kind of camera; film positions (x, y) are in pixels from the upper left corner.
 
     A perspective ray starts at `origin` and points along `corner` + x `du` + y `dv`; an orthographic one starts at
-    `origin` + x `du` + y `dv` and points along `corner`.
+    `origin` + x `du` + y `dv` and points along `corner`. A spherical one looks along `corner` in the middle of its
+    film, with `du` to the right and `dv` upwards.
     """
 
     origin: wp.vec3
@@ -28,6 +29,7 @@ class Camera:
     lens_x: wp.vec3  # radii of the lens
     lens_y: wp.vec3
     focus_scale: wp.float32  # length of `corner` + x `du` + y `dv` over the distance to the plane of focus on that line
+    turn: wp.vec2  # longitude and latitude of a pixel of the spherical camera, radians
 
 
 @wp.struct
@@ -48,7 +50,7 @@ def make_camera_ray(kind: str):
     (Cook, Porter and Carpenter 1984, "Distributed Ray Tracing"); a camera without a lens does not read it.
 
     Args:
-        kind: ``perspective``, ``thin_lens`` or ``orthographic``.
+        kind: ``perspective``, ``thin_lens``, ``orthographic`` or ``spherical``.
     """
 
     @wp.func
@@ -66,6 +68,11 @@ def make_camera_ray(kind: str):
             ray.origin = camera.origin + lens
             focus = camera.corner + x * camera.du + y * camera.dv
             ray.direction = wp.normalize(focus - camera.focus_scale * lens)
+        if wp.static(kind == "spherical"):  # beyond an edge it goes on over the pole, or around
+            longitude = x * camera.turn[0] - wp.static(math.pi)
+            polar = y * camera.turn[1]
+            level = wp.sin(longitude) * camera.du + wp.cos(longitude) * camera.corner
+            ray.direction = wp.normalize(wp.sin(polar) * level + wp.cos(polar) * camera.dv)
         return ray
 
     return camera_ray
@@ -85,10 +92,20 @@ def make_camera(camera: description.Camera, film: description.Film) -> Camera:
         record.du = wp.vec3(*(right * (2.0 * half_width / width)))
         record.dv = wp.vec3(*(up * (-2.0 * half_height / height)))
         return record
+    if isinstance(camera, description.Spherical):
+        # Only the direction matters; scaled so that tiny and huge transforms keep float32's digits.
+        scale = 1.0 / np.abs(matrix[:3, :3]).max()
+        record = Camera()
+        record.origin = wp.vec3(*origin)
+        record.corner = wp.vec3(*(-back * scale))
+        record.du = wp.vec3(*(right * scale))
+        record.dv = wp.vec3(*(up * scale))
+        record.turn = wp.vec2(2.0 * math.pi / film.width, math.pi / film.height)
+        return record
     half_width, half_height = half_extent(camera, film)
     x, y = camera.principal_point_offset
     corner = (2.0 * x - 1.0) * half_width * right + (1.0 - 2.0 * y) * half_height * up - back
-    # Only the direction matters; scaled so that tiny and huge transforms keep float32's digits.
+    # As above.
     scale = 1.0 / max(np.abs(corner).max(), np.finfo(np.float64).tiny)
     record = Camera()
     record.origin = wp.vec3(*origin)

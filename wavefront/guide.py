@@ -54,6 +54,12 @@ MIN_SAMPLE_WEIGHT = 1e-3
 LIGHTS = "lights"
 DIRECTIONS = "directions"
 
+# What the density of a guide may be meant to be proportional to, at a vertex.
+RADIANCE = "radiance"  # Li
+RADIANCE_COSINE = "radiance-cosine"  # Li |cos|
+PRODUCT = "product"  # f Li |cos|
+TARGETS = (RADIANCE, RADIANCE_COSINE, PRODUCT)
+
 
 @dataclasses.dataclass(frozen=True)
 class GuideVertex:
@@ -156,6 +162,7 @@ class Guide(ABC):
         name: Of the method, for checkpoints and accounts.
         key: Hashable values that tell this guide's kernels from those of other settings; with the name in `Features`.
         has_pdf: Whether the density of its directions is known. False for resampling.
+        target: One of `TARGETS`: what the density is to be compared with, as `tools.inspect_guide` does.
         weighted: Whether samples enter the film with the weight of `sample_weight`, else with 1.
         rounds: Calls of `GuideState.propose` per bounce, 1 or more.
         bsdf_share: Probability of sampling the BSDF where `GuideState.prepare` does not say otherwise; more than 0, at
@@ -168,6 +175,7 @@ class Guide(ABC):
     name: str
     key: tuple = ()
     has_pdf: bool = True
+    target: str = PRODUCT
     weighted: bool = False
     rounds: int = 1
     bsdf_share: float = 0.5
@@ -276,6 +284,8 @@ def check_guide(guide: Guide) -> None:
         raise WavefrontError(f"guide {guide.name}: a BSDF share of {guide.bsdf_share}; allowed: more than 0, up to 1")
     if guide.rounds < 1:
         raise WavefrontError(f"guide {guide.name}: {guide.rounds} rounds of proposals; allowed: 1 or more")
+    if guide.target not in TARGETS:
+        raise WavefrontError(f"guide {guide.name}: target {guide.target!r}; allowed: {', '.join(TARGETS)}")
     unknown = [name for name in guide.inputs if name not in INPUTS]
     if unknown:
         raise WavefrontError(f"guide {guide.name}: inputs {', '.join(unknown)}; allowed: {', '.join(INPUTS)}")

@@ -132,7 +132,7 @@ def test_text_that_is_not_json_is_refused_with_its_place(error, raw, message):
         ({"camera": {"fov": 180}}, "camera.fov: expected a number > 0 and < 180; found 180"),
         (
             {"camera": {"type": "fisheye"}},
-            "camera.type: unknown type 'fisheye'; allowed: 'perspective', 'thin_lens', 'orthographic'",
+            "camera.type: unknown type 'fisheye'; allowed: 'perspective', 'thin_lens', 'orthographic', 'spherical'",
         ),
         ({"camera": {"type": "thin_lens", "aperture_radius": 1}}, "camera: missing key 'focus_distance'"),
         (
@@ -261,6 +261,7 @@ CAMERAS = [
     d.Perspective(fov=30.0, principal_point_offset=(0.25, -0.5)),
     d.ThinLens(fov=30.0, fov_axis="y", aperture_radius=0.1, focus_distance=3.0),
     d.Orthographic(width=3.0, to_world=[d.TransformStep(scale=2.0)]),
+    d.Spherical(to_world=[d.TransformStep(translate=(1.0, 2.0, 3.0))]),
 ]
 
 

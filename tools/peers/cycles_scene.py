@@ -362,8 +362,10 @@ def camera_record(camera: description.Camera, film: description.Film) -> dict:
     """Blender's camera, which looks along its -Z as ours does: ``properties`` and ``matrix``.
 
     Raises:
-        SceneError: Its transform is more than a rotation, a translation and a uniform scale.
+        SceneError: It is spherical, or its transform is more than a rotation, a translation and a uniform scale.
     """
+    if isinstance(camera, description.Spherical):
+        raise SceneError("spherical; with cycles: perspective, thin_lens, orthographic", path="camera.type")
     matrix = to_matrix(camera.to_world, "camera.to_world")
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     rotation = matrix[:3, :3] / scale

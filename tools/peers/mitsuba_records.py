@@ -82,6 +82,8 @@ class _Writer:
         window = film.window
         frame = CAMERA_FRAME
         result = self._media(medium=camera.medium)
+        if isinstance(camera, description.Spherical):
+            raise WavefrontError("camera.type: spherical; Mitsuba has no such sensor")
         if isinstance(camera, description.Orthographic):
             result |= {"type": "orthographic"}
             frame = CAMERA_FRAME @ np.diag([camera.width / 2.0, camera.width / 2.0, 1.0, 1.0])

@@ -604,7 +604,15 @@ class Orthographic(Record, tag_field="type", tag="orthographic"):
     medium: CameraMedium = None
 
 
-Camera = Perspective | ThinLens | Orthographic
+class Spherical(Record, tag_field="type", tag="spherical"):
+    """Camera that sees all directions: its film is a map in longitude and latitude, with local -Z in the middle, +X to
+    the right of it and +Y on top."""
+
+    to_world: Transform = []
+    medium: CameraMedium = None
+
+
+Camera = Perspective | ThinLens | Orthographic | Spherical
 
 
 class BoxFilter(Record, tag_field="type", tag="box"):

@@ -1,11 +1,13 @@
-"""What the other stages decide and do not keep, told again for one path: its hit, and the light that it sampled."""
+"""What the other stages decide and do not keep, told again for one path: its hit, the light that it sampled, and how
+the surface scatters."""
 
 import functools
 
 import warp as wp
 
 from wavefront.accel.mesh_query import Geometry, hit_type, make_intersector
-from wavefront.bsdf.dispatch import is_smooth
+from wavefront.bsdf.dispatch import is_smooth, make_bsdf
+from wavefront.bsdf.frame import make_frame
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.light.sampling import LightSample, make_light_sampler, select_light
 from wavefront.light.tables import LightTables
@@ -65,3 +67,35 @@ def make_inspect_light(lights: tuple[str, ...], light_textures: tuple[str, ...],
             sample[0] = sample_light(lights, geometry, textures, surfaces.position[0], u)
 
     return inspect_light
+
+
+@functools.cache
+def make_inspect_bsdf(
+    bsdfs: tuple[str, ...], mask: bool, textures: tuple[str, ...], uvs: bool, tangents: bool, maps: tuple[str, ...]
+):
+    """Kernel that evaluates the BSDF at the vertex in slot 0, a thread per direction: f |cos| and the density of BSDF
+    sampling, without deltas. The arguments are fields of `Features`."""
+    eval_bsdf, _, _ = make_bsdf(bsdfs, mask, textures, tangents, bool(maps))
+    frame_at, _ = make_frame(tangents, bool(maps))
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def inspect_bsdf(
+        materials: MaterialTables,
+        textures: TextureTables,
+        paths: Paths,
+        surfaces: Surfaces,
+        directions: wp.array[wp.vec3],
+        # out
+        values: wp.array[wp.vec3],
+        pdfs: wp.array[wp.float32],
+    ):
+        i = wp.tid()
+        uv = wp.vec2(0.0)
+        if wp.static(uvs):
+            uv = surfaces.uv[0]
+        wo = -paths.direction[0]
+        bsdf = eval_bsdf(materials, textures, surfaces.material[0], uv, frame_at(surfaces, 0), wo, directions[i])
+        values[i] = bsdf.value
+        pdfs[i] = bsdf.pdf
+
+    return inspect_bsdf
