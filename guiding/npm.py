@@ -25,7 +25,7 @@ import numpy as np
 import warp as wp
 
 from guiding import npm_kernels
-from guiding.distributions.vmf_mixture import DIRECTIONS, make_vmf_mixture, spread_lobes
+from guiding.distributions.vmf_mixture import DIRECTIONS, make_vmf_mixture
 from nn import Model
 from wavefront.guide import (
     MIN_SAMPLE_WEIGHT,
@@ -45,8 +45,6 @@ Decay = Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0.0)]
 
-FIRST_KAPPA = 3.0  # of lobes that are spread: the density of 8 is 0.75 to 1.14 times uniform
-
 
 class NpmSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """All that can be chosen; `guiding/presets` has the choices of the paper.
@@ -55,8 +53,6 @@ class NpmSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         product: Learn f Li from position, wo, normal and roughness; else Li from the position.
         n_lobes: Lobes of the mixture.
         direction: How the network gives mean directions: two ``angles``, or a ``vector`` that is normalised.
-        spread_lobes: The network has biases, and begins with lobes that are spread over the sphere; else all lobes
-            begin close to each other.
         cosine_aware: Draw from the product of the mixture with the cosine lobe.
         product_cosine: Train that product, on the target times the cosine; else the mixture alone, on the target.
         mis_aware: Weight the target by the guide's part of the density of the mixture of techniques.
@@ -84,7 +80,6 @@ class NpmSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     product: bool
     n_lobes: Annotated[int, msgspec.Meta(ge=1, le=64)] = 8
     direction: Literal["angles", "vector"] = "angles"
-    spread_lobes: bool = False
     cosine_aware: bool = True
     product_cosine: bool = False
     mis_aware: bool = True
@@ -169,7 +164,6 @@ class NpmSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
                 "n_hidden_layers": self.n_hidden_layers,
                 "activation": "ReLU",
                 "output_activation": "None",
-                "bias": self.spread_lobes,
             },
             "optimizer": optimizer,
             "precision": self.precision,
@@ -211,12 +205,6 @@ class NpmGuide(Guide):
         self.model = Model.from_config(
             s.model(), s.n_inputs, s.n_outputs, device=device, seed=self.seed, threads=self.threads
         )
-        if s.spread_lobes:
-            lobes, first = spread_lobes(s.n_lobes, s.direction, FIRST_KAPPA), self.model.networks[0].layers[-1].bias
-            values = self.model.parameters.numpy().copy()
-            values[first : first + lobes.size] = lobes
-            self.model.parameters.assign(values)
-            self.model.inference_parameters.assign(values)
         self.kernels = npm_kernels.make_kernels(
             s.product, s.cosine_aware, s.learned_share, features.sampler, self.mixture
         )

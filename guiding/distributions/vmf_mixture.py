@@ -20,7 +20,6 @@ decodes, takes 900 and 450 ns. Times are proportional to the number of lobes.
 import dataclasses
 import functools
 
-import numpy as np
 import warp as wp
 
 from guiding.distributions.vmf import multiply_vmf, one_minus_cosine, sample_vmf, vmf_moments, vmf_peak
@@ -177,28 +176,6 @@ def make_vmf_mixture(n_lobes: int, direction: str = "angles", log_kappa_limit: f
     if not 0.0 < log_kappa_limit <= LOG_KAPPA_LIMIT:
         raise ValueError(f"log_kappa_limit: found {log_kappa_limit}; allowed: above 0, at most {LOG_KAPPA_LIMIT}")
     return _make(int(n_lobes), direction, float(log_kappa_limit))
-
-
-def spread_lobes(n_lobes: int, direction: str, kappa: float) -> np.ndarray:
-    """Raw outputs of a mixture of equal lobes that are spread evenly over the sphere, on a spiral (Vogel 1979).
-
-    Args:
-        n_lobes, direction: As of `make_vmf_mixture`.
-        kappa: Of all lobes.
-
-    Returns:
-        float32 [n_params].
-    """
-    k = np.arange(n_lobes)
-    z = 1.0 - (2.0 * k + 1.0) / n_lobes
-    turn = np.mod(k * (np.sqrt(5.0) - 1.0) / 2.0 + 0.25, 1.0)  # no lobe at 0, which is no angle
-    if direction == "vector":
-        r = np.sqrt(1.0 - z * z)
-        parts = [r * np.cos(2.0 * np.pi * turn), r * np.sin(2.0 * np.pi * turn), z]
-    else:
-        parts = [np.log(p / (1.0 - p)) for p in (np.arccos(z) / np.pi, turn)]
-    columns = [np.zeros(n_lobes), np.full(n_lobes, np.log(kappa)), *parts]
-    return np.stack(columns, axis=1).astype(np.float32).ravel()
 
 
 @functools.cache
