@@ -107,17 +107,21 @@ def test_summary_by_hand():
     slow, fast, short = summarise(results(records))
     np.testing.assert_allclose(costs(records[:2], "relmse"), [0.8, 0.4])
     np.testing.assert_allclose(costs(records[2:4], "mae"), [0.1, 0.04])  # no square: it counts squared
-    assert slow.efficiency["relmse"] == pytest.approx(1.0 / 0.6)
-    assert fast.efficiency["relmse"] == pytest.approx(1.0 / 0.07)
+    # Less a floor of 0.1^2, the errors of relmse are 0.39, 0.19, 0.09 and 0.01, their costs 0.78, 0.38, 0.09 and 0.02.
+    assert slow.efficiency["relmse"] == pytest.approx(1.0 / 0.58)
+    assert fast.efficiency["relmse"] == pytest.approx(1.0 / 0.055)
     assert fast.efficiency["mae"] == pytest.approx(1.0 / 0.07)
-    assert fast.speed_up["relmse"].mean == pytest.approx(0.6 / 0.07)
-    assert fast.error_ratio["relmse"].mean == pytest.approx(0.3 / 0.06)
-    # Relative variances of the means of costs: (0.2 sqrt 2 / 0.6)^2 / 2 and (0.03 sqrt 2 / 0.07)^2 / 2.
-    parts = [(0.2 / 0.6) ** 2, (0.03 / 0.07) ** 2]
+    assert fast.speed_up["relmse"].mean == pytest.approx(0.58 / 0.055)
+    assert fast.error_ratio["relmse"].mean == pytest.approx(0.29 / 0.05)
+    assert fast.error_ratio["mae"].mean == pytest.approx(
+        (math.sqrt(0.4) + math.sqrt(0.2)) / (math.sqrt(0.1) + math.sqrt(0.02))
+    )
+    # Relative variances of the means of costs: (0.2 sqrt 2 / 0.58)^2 / 2 and (0.035 sqrt 2 / 0.055)^2 / 2.
+    parts = [(0.2 / 0.58) ** 2, (0.035 / 0.055) ** 2]
     degrees = sum(parts) ** 2 / sum(part**2 for part in parts)
     factor = math.exp(stats.t.ppf(0.975, degrees) * math.sqrt(sum(parts)))
-    assert fast.speed_up["relmse"].high == pytest.approx(0.6 / 0.07 * factor)
-    assert fast.speed_up["relmse"].low == pytest.approx(0.6 / 0.07 / factor)
+    assert fast.speed_up["relmse"].high == pytest.approx(0.58 / 0.055 * factor)
+    assert fast.speed_up["relmse"].low == pytest.approx(0.58 / 0.055 / factor)
     assert slow.speed_up == {}
     assert (short.speed_up, short.notes) == ({}, ["other"])
     assert (slow.runs, slow.overhead, slow.training) == (2, 3.0, 0.5)

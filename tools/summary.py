@@ -2,8 +2,9 @@
 
 Runs of a cell (one scene, method and budget) differ in their seeds alone and are independent. Intervals are of 95 %, by
 Student's t on the runs, which rests on means of runs being nearly normal: with a handful of runs of a method with rare
-bright samples they are too short, and with one run there is none. What the noise of the reference adds is the same for
-all runs and in no interval; `Cell.floor` says how much it is.
+bright samples they are too short, and with one run there is none. What the noise of the reference adds to an error is
+the same for all runs and in no interval; `Cell.floor` says how much it is. Efficiency, speed-up and ratios are of what
+is above it.
 
 The *efficiency* is 1 / (error · time) for errors that are squares, and so fall with 1/time; for others, which fall with
 its root, 1 / (error² · time). The *speed-up* over the baseline is the ratio of the efficiencies at the same budget: the
@@ -88,9 +89,15 @@ def ratio_figure(a: Sequence[float], b: Sequence[float]) -> Figure:
     return Figure(ratio, ratio / factor, ratio * factor)
 
 
-def costs(records: Sequence[Record], metric: str) -> np.ndarray:
-    """Error times time of each run, for a metric that is no square its square times time; 1 / it is the efficiency."""
-    errors = np.array([record.errors[metric] for record in records])
+def errors_above(records: Sequence[Record], metric: str, floor: float) -> np.ndarray:
+    """The error of each run, less what the noise of the reference adds."""
+    return np.array([record.errors[metric] for record in records]) - floor
+
+
+def costs(records: Sequence[Record], metric: str, floor: float = 0.0) -> np.ndarray:
+    """Error above the floor times time of each run, for a metric that is no square its square times time; 1 / it is the
+    efficiency."""
+    errors = errors_above(records, metric, floor)
     seconds = np.array([record.seconds.render for record in records])
     return (errors if metric in SQUARES else errors**2) * seconds
 
@@ -110,7 +117,7 @@ class Cell:
         efficiency: By metric, 1 / mean cost.
         speed_up: Over the baseline, by metric; empty without one, and where there are notes.
         error_ratio: Error of the baseline over this, by metric: what the method gains at the same budget.
-        floor: By metric, the part of the error that comes from the noise of the reference, where it is known.
+        floor: By metric, what the noise of the reference adds to the errors, where it is known.
         notes: Of its runs.
     """
 
@@ -152,19 +159,23 @@ class Cell:
 def summarise(results: Results) -> list[Cell]:
     """The cells of an experiment that have runs, in its order."""
     cells, experiment = results.cells(), results.experiment
-    floors = {scene.name: scene.reference.error**2 for scene in experiment.scenes}
+    floors = {scene.name: {"relmse": scene.reference.error**2} for scene in experiment.scenes}
     summary = []
     for (scene, method, budget), records in cells.items():
         baseline = cells.get((scene, experiment.baseline, budget)) if experiment.baseline else None
         errors = {metric: [record.errors[metric] for record in records] for metric in experiment.metrics}
         notes = sorted({note for record in records for note in record.notes})
-        speed_up, error_ratio = {}, {}
+        speed_up, error_ratio, floor = {}, {}, {m: floors[scene][m] for m in experiment.metrics if m in floors[scene]}
         if baseline and method != experiment.baseline:
             for metric in experiment.metrics:
                 if not notes:
-                    speed_up[metric] = ratio_figure(costs(baseline, metric), costs(records, metric))
-                error_ratio[metric] = ratio_figure([b.errors[metric] for b in baseline], errors[metric])
-        mean_costs = {metric: float(costs(records, metric).mean()) for metric in experiment.metrics}
+                    speed_up[metric] = ratio_figure(
+                        *(costs(r, metric, floor.get(metric, 0.0)) for r in (baseline, records))
+                    )
+                error_ratio[metric] = ratio_figure(
+                    *(errors_above(r, metric, floor.get(metric, 0.0)) for r in (baseline, records))
+                )
+        mean_costs = {metric: float(costs(records, metric, floor.get(metric, 0.0)).mean()) for metric in errors}
         summary.append(
             Cell(
                 scene,
@@ -179,7 +190,7 @@ def summarise(results: Results) -> list[Cell]:
                 {metric: 1.0 / cost for metric, cost in mean_costs.items() if cost > 0.0},
                 speed_up,
                 error_ratio,
-                {metric: floors[scene] for metric in experiment.metrics if metric == "relmse"},
+                floor,
                 notes,
             )
         )
@@ -200,7 +211,8 @@ def _cells(cell: Cell, metric: str, baseline: str | None) -> list[str]:
     row += [str(cell.errors[metric]), f"{cell.seconds.mean:.3g}", f"{cell.samples.mean:.4g}"]
     row.append(f"{cell.efficiency[metric]:.3g}" if metric in cell.efficiency else "")
     if baseline:
-        row.append("1" if cell.method == baseline else str(cell.speed_up[metric]) if metric in cell.speed_up else "")
+        speed_up = cell.speed_up.get(metric, Figure(math.nan))  # not a number if an error is all noise of the reference
+        row.append("1" if cell.method == baseline else str(speed_up) if math.isfinite(speed_up.mean) else "")
     return row
 
 
@@ -244,7 +256,7 @@ def remarks(results: Results, cells: Sequence[Cell]) -> list[str]:
         if shares and max(shares) > NOISY_REFERENCE:
             lines.append(
                 f"{scene.name}: up to {100.0 * min(max(shares), 1.0):.0f} % of a relMSE is the noise of the reference "
-                f"(relative standard error {scene.reference.error:.2g})"
+                f"(relative standard error {scene.reference.error:.2g}); efficiency and speed-up leave it out"
             )
         for comparison in scene.reference.comparisons:
             if comparison["verdict"] != "same":
