@@ -45,6 +45,8 @@ Decay = Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0.0)]
 
+LEAST_RECORD = 128  # bytes that a record takes of the memory for records, at least: its row, and what becomes of it
+
 
 class NpmSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """All that can be chosen; `guiding/presets` has the choices of the paper.
@@ -199,6 +201,8 @@ class NpmGuide(Guide):
 
     def bind(self, scene, device_scene, features, device):
         s, self.device = self.settings, device
+        pixels, depth = scene.film.window.width * scene.film.window.height, scene.integrator.max_depth - 1
+        self.most_records = min(pixels * min(depth, s.record_depth), self.records.memory // LEAST_RECORD)
         low, high = np.asarray(device_scene.bounds, np.float64)
         extent = np.where(high > low, high - low, 1.0)
         self.unit_cube = wp.vec3(*low), wp.vec3(*(1.0 / extent))
@@ -233,7 +237,9 @@ class NpmGuide(Guide):
         return 4 * (self.settings.n_inputs + self.settings.n_outputs) + mixture
 
     def nbytes(self):
-        return sum(array.capacity for array in self.arrays().values()) if hasattr(self, "model") else 0
+        learned = self.model.gradients.capacity + sum(array.capacity for array in self.arrays().values())
+        columns = self.settings.n_inputs + self.settings.n_targets + 2 * self.model.encoding.stride  # and its gradient
+        return learned + 4 * self.most_records + 4 * columns * -(-self.most_records // self.settings.steps_per_spp)
 
     # --- training --------------------------------------------------------------------------------------------------
 

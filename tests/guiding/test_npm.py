@@ -19,7 +19,8 @@ from guiding.npm_kernels import make_training, make_vertex_loss
 from nn import Model
 from tests.guiding import vmf_oracle as oracle
 from wavefront.guide import GuideVertex
-from wavefront.recording import FIELDS, RecordArrays, Records
+from wavefront.recording import FIELDS, RecordArrays, Recorder, Records
+from wavefront.scene import description as d
 
 DEVICE = "cpu"
 BOUNDS = np.array([[-1.0, 0.0, 2.0], [3.0, 1.0, 2.5]])
@@ -28,7 +29,8 @@ BOUNDS = np.array([[-1.0, 0.0, 2.0], [3.0, 1.0, 2.5]])
 def bound(**settings) -> NpmGuide:
     """A guide without a renderer, over `BOUNDS`."""
     guide = NpmGuide(NpmSettings(**settings), seed=3)
-    guide.bind(None, SimpleNamespace(bounds=BOUNDS), SimpleNamespace(sampler="independent"), DEVICE)
+    scene = d.Scene(film=d.Film(width=64, height=64), integrator=d.PathIntegrator(max_depth=5))
+    guide.bind(scene, SimpleNamespace(bounds=BOUNDS), SimpleNamespace(sampler="independent"), DEVICE)
     return guide
 
 
@@ -313,6 +315,18 @@ def test_a_known_field_is_learned(product, direction):
     per_record = np.std(target.numpy()[:, 3]) * np.log(4.0 * np.pi) / np.sqrt(n)
     error = np.hypot(losses.std() / np.sqrt(len(losses)), per_record)
     assert abs(loss - losses.mean()) < 5.0 * error
+
+
+@pytest.mark.parametrize("product", [False, True])
+@pytest.mark.parametrize(("width", "depth"), [(64, 4), (64, 12), (4096, 12)])
+def test_memory_of_training(product, width, depth):
+    """No pass has more records than the memory is planned for."""
+    guide = NpmGuide(NpmSettings(product=product, **SMALL), seed=3)
+    scene = d.Scene(film=d.Film(width=width, height=width), integrator=d.PathIntegrator(max_depth=depth))
+    guide.bind(scene, SimpleNamespace(bounds=BOUNDS), SimpleNamespace(sampler="independent"), DEVICE)
+    recorder = Recorder(guide.records, depth, width, width, DEVICE)
+    assert recorder.rows.count * recorder.rows.depth <= guide.most_records
+    assert guide.nbytes() < 1 << 30
 
 
 def test_zero_and_one_record():
