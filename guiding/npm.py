@@ -61,8 +61,6 @@ class NpmSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         learned_share: The network also gives the share of BSDF sampling, from `bsdf_share` at the beginning.
         brightness_cells: Divide the target by its mean in cells of a grid of so many per axis, so that dark places are
             learned like bright ones; 0: do not. The optimum at each place is the same.
-        largest_target: With `brightness_cells`: a target over its density counts as so many times the brightness of its
-            place at most; 0: without limit.
         whole_emission: With light sampling: learn all light; else the emission that lights are sampled for counts by
             its weight against light sampling.
         bsdf_share: Probability of sampling the BSDF, more than 0.
@@ -89,7 +87,6 @@ class NpmSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     mis_aware: bool = True
     learned_share: bool = False
     brightness_cells: Annotated[int, msgspec.Meta(ge=0, le=256)] = 0
-    largest_target: NonNegative = 0.0
     whole_emission: bool = False
     bsdf_share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.5
     train_share: Fraction = 0.25
@@ -267,11 +264,10 @@ class NpmGuide(Guide):
         if s.brightness_cells:
             inputs = [records.position, self.weights, *self.unit_cube, s.brightness_cells]
             self._launch(npm_kernels.sum_brightness, n, inputs, [self.cells])
-        largest = s.largest_target or math.inf
         for k in range(steps):
             count = len(range(k, n, steps))
             x, target = self._batch(count)
-            inputs = [arrays, self.weights, self.cells, s.brightness_cells, largest, k, steps, *self.unit_cube]
+            inputs = [arrays, self.weights, self.cells, s.brightness_cells, k, steps, *self.unit_cube]
             self._launch(self.gather_batch, count, inputs, [x, target])
             last = k == steps - 1
             loss = self.model.train_step(x, target, loss=self.kl_loss, report=last)

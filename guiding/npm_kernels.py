@@ -198,7 +198,6 @@ def make_training(product: bool, mis_aware: bool, product_cosine: bool, vertex_l
         weights: wp.array[wp.float32],
         cells: wp.array[wp.float64],
         cells_per_axis: int,
-        largest: float,
         first: int,
         stride: int,
         origin: wp.vec3,
@@ -220,7 +219,6 @@ def make_training(product: bool, mis_aware: bool, product_cosine: bool, vertex_l
         weight = weights[i]
         if cells_per_axis > 0:
             weight /= brightness(cells, cells_per_axis, cell_of(records.position[i], origin, scale, cells_per_axis))
-            weight = wp.min(weight, largest)
         wi = records.wi[i]
         target[row, 0] = wi[0]
         target[row, 1] = wi[1]
