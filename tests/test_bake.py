@@ -178,5 +178,5 @@ def test_what_baking_needs(folder, tmp_path, capsys, monkeypatch):
     assert convert.main([str(tmp_path / "scene.json"), str(tmp_path / "out.json"), "--bake-emitters"]) == 2
     assert "--bake-emitters needs a Mitsuba scene" in capsys.readouterr().err
     monkeypatch.setitem(__import__("sys").modules, "mitsuba", None)
-    with pytest.raises(WavefrontError, match=r"pip install 'wavefront\[mitsuba\]'"):
+    with pytest.raises(WavefrontError, match=r"pip install '\.\[mitsuba\]'"):
         bake.bake_sunsky(folder / "scene.xml", tmp_path)
