@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 import shutil
@@ -11,8 +12,9 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from tools import preset_check, results, trade
+from tools import experiment, preset_check, results, trade
 from tools.frontier import DOMINATED
+from tools.methods import Wavefront
 from tools.reference_store import target_records
 from wavefront import load_scene, presets
 from wavefront.presets import NAMES, load_preset
@@ -114,6 +116,31 @@ SETTINGS = {
 }
 
 
+class ClockOfWork:
+    """Counts what was asked for, as seconds: to render 12 by 10 pixels takes too little time to measure it."""
+
+    def __init__(self):
+        self.seconds = 0.0
+
+    def __call__(self) -> float:
+        return self.seconds
+
+    def patched(self, add):
+        def counted(engine: Wavefront, spp: int, seconds: float | None = None):
+            add(engine, spp, seconds)
+            integrator = engine.renderer.scene.integrator
+            self.seconds += spp * min(integrator.max_depth, integrator.rr_depth or 20) * (1.0 + integrator.nee)
+
+        return counted
+
+
+@pytest.fixture
+def work(monkeypatch):
+    clock = ClockOfWork()
+    monkeypatch.setattr(Wavefront, "add", clock.patched(Wavefront.add))
+    monkeypatch.setattr(experiment, "run_once", functools.partial(experiment.run_once, now=clock))
+
+
 def check(tmp_path, monkeypatch, *arguments, **changes) -> int:
     """The check with presets of a few samples and one small scene."""
     folder = tmp_path / "presets"
@@ -129,7 +156,7 @@ def check(tmp_path, monkeypatch, *arguments, **changes) -> int:
     return trade.main([*command, "-o", str(tmp_path / "results"), *arguments])
 
 
-def test_check_of_presets(tmp_path, monkeypatch, capsys):
+def test_check_of_presets(tmp_path, monkeypatch, capsys, work):
     assert check(tmp_path, monkeypatch, "--update-presets") == 0
     assert "WAVEFRONT_SCENES, which is not set, are left out" in capsys.readouterr().err
     origin = json.loads((tmp_path / "presets" / "reference.json").read_text())["origin"]
