@@ -10,6 +10,7 @@ a coordinate. Corners are exact, not quantised.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import time
 
 import numpy as np
@@ -142,10 +143,9 @@ def fit_nodes(
         high = wp.vec3(-wp.inf)
         if link >= 0:
             for axis in range(3):
-                l = bvh.nodes[NODE_VECTORS * link + 2 * axis]
-                h = bvh.nodes[NODE_VECTORS * link + 6 + 2 * axis]
-                low[axis] = wp.min(wp.min(l), wp.min(bvh.nodes[NODE_VECTORS * link + 2 * axis + 1]))
-                high[axis] = wp.max(wp.max(h), wp.max(bvh.nodes[NODE_VECTORS * link + 6 + 2 * axis + 1]))
+                side = NODE_VECTORS * link + 2 * axis
+                low[axis] = wp.min(wp.min(bvh.nodes[side]), wp.min(bvh.nodes[side + 1]))
+                high[axis] = wp.max(wp.max(bvh.nodes[side + 6]), wp.max(bvh.nodes[side + 7]))
         elif link != EMPTY:
             first = ~link // max_blocks - first_block
             for b in range(first, first + ~link % max_blocks + 1):
@@ -215,7 +215,7 @@ class _Hierarchy:
         lower, upper = (wp.empty(self.block_count, dtype=wp.vec3, device=self.device) for _ in range(2))
         wp.launch(write, self.block_count, inputs=inputs, outputs=[self.bvh, lower, upper], device=self.device)
         levels = self.wide.levels
-        for first, end in reversed(list(zip(levels, levels[1:], strict=False))):
+        for first, end in reversed(list(itertools.pairwise(levels))):
             inputs = [self.bvh, lower, upper, self.max_blocks, self.first_block, self.first_node + first]
             wp.launch(fit_nodes, end - first, inputs=inputs, device=self.device)
 

@@ -1,4 +1,4 @@
-"""From a binary tree to a wide one: which boxes become children, by dynamic programming (Ylitie, Karras and Laine 2017).
+"""From a binary tree to a wide one: what becomes a child, by dynamic programming (Ylitie, Karras and Laine 2017).
 
 C(n, i) is the least cost, by the surface area heuristic, of representing the boxes below node n by at most i children
 of some wide node. A node is one child, as a leaf or as a wide node of its own, or hands its places on to both its
@@ -8,6 +8,7 @@ children: C(n, i) = min over 0 < k < i of C(left, k) + C(right, i - k).
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 import warp as wp
@@ -234,7 +235,7 @@ def collapse(binary: BinaryTree, block: int, max_blocks: int) -> WideTree:
     tree, device, n = binary.tree, binary.boxes.device, binary.boxes.shape[0]
     total = 2 * n - 1
     costs = wp.empty(total, dtype=Costs, device=device)
-    rounds = list(zip(binary.starts, binary.starts[1:], strict=False))
+    rounds = list(itertools.pairwise(binary.starts))
     for first, end in rounds:
         wp.launch(find_costs, end - first, inputs=[tree, first, block, max_blocks], outputs=[costs], device=device)
     ranges = wp.zeros(total, dtype=wp.int32, device=device)

@@ -70,7 +70,8 @@ _STREAM = """
         SOURCE
         for (int k = 0; k < 3; ++k) {
             r.o[k] = o[k];
-            const float slope = 1.0f / (__builtin_fabsf(d[k]) < 1.0f / STEEPEST ? __builtin_copysignf(1.0f / STEEPEST, d[k]) : d[k]);
+            const bool along = __builtin_fabsf(d[k]) < 1.0f / STEEPEST;
+            const float slope = along ? __builtin_copysignf(STEEPEST, d[k]) : 1.0f / d[k];
             r.near_slope[k] = slope;
             r.far_slope[k] = slope * FAR_SLACK;
             r.near_side[k] = 8 * k + (slope < 0.0f ? 24 : 0);
