@@ -268,12 +268,9 @@ class TriangleBvh(_Hierarchy):
         wp.launch(triangle_bounds, count, inputs=[points, indices], outputs=[lower, upper], device=device)
         super().__init__(_topology(lower, upper, BLOCK, MAX_BLOCKS), MAX_BLOCKS, device)
         self.indices, self.first_triangle = indices, first_triangle
-        self.place_alone(points)
+        place_triangles([self], points)
         wp.synchronize_device(device)
         self.build_seconds = time.perf_counter() - begin
-
-    def place_alone(self, points: wp.array) -> None:
-        place_triangles([(self, points)])
 
     def refit(self, points: wp.array) -> None:
         """Moves the vertices and fits the boxes to them; which triangles are together stays.
@@ -293,16 +290,17 @@ def _tables(nodes: int, block_vectors: int, device) -> Bvh:
     return bvh
 
 
-def place_triangles(hierarchies: list[tuple[TriangleBvh, wp.array]]) -> Bvh:
-    """Puts hierarchies, each with its vertices, into common tables, which they share from then on.
+def place_triangles(hierarchies: list[TriangleBvh], points: wp.array) -> Bvh:
+    """Puts hierarchies over triangles of the same vertices into common tables, which they share from then on.
 
     The root of each is its `first_node`.
     """
-    device = hierarchies[0][0].device
-    nodes, blocks = (sum(getattr(h, name) for h, _ in hierarchies) for name in ("node_count", "block_count"))
-    bvh = _tables(nodes, BLOCK_VECTORS * blocks, device)
+    if len(hierarchies) == 1 and hierarchies[0].bvh is not None:
+        return hierarchies[0].bvh
+    nodes, blocks = (sum(getattr(h, name) for h in hierarchies) for name in ("node_count", "block_count"))
+    bvh = _tables(nodes, BLOCK_VECTORS * blocks, points.device)
     first_node = first_block = 0
-    for hierarchy, points in hierarchies:
+    for hierarchy in hierarchies:
         hierarchy._place(bvh, first_node, first_block)
         hierarchy.refit(points)
         first_node += hierarchy.node_count

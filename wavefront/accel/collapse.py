@@ -92,6 +92,8 @@ def is_leaf(tree: Tree, costs: wp.array[Costs], node: int, block: int, max_block
     """Whether a node that takes one place is a leaf."""
     if tree.children[node][0] < 0:
         return True
+    if tree.count[node] > block * max_blocks:
+        return False
     area = half_area(tree.lower[node], tree.upper[node])
     return leaf_cost(area, tree.count[node], block, max_blocks) <= costs[node][WIDTH - 1]
 

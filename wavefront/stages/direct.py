@@ -6,7 +6,7 @@ import functools
 
 import warp as wp
 
-from wavefront.accel.mesh_query import Geometry
+from wavefront.accel.geometry import Geometry
 from wavefront.bsdf.dispatch import is_smooth
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.light.mis import power_heuristic

@@ -6,7 +6,7 @@ import functools
 
 import warp as wp
 
-from wavefront.accel.mesh_query import Geometry
+from wavefront.accel.geometry import Geometry
 from wavefront.light.mis import power_heuristic
 from wavefront.light.sampling import make_light_sampler
 from wavefront.light.tables import AREA, LightTables

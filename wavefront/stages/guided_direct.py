@@ -9,7 +9,7 @@ import functools
 
 import warp as wp
 
-from wavefront.accel.mesh_query import Geometry
+from wavefront.accel.geometry import Geometry
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.light.tables import LightTables
 from wavefront.proposals import LightProposals

@@ -5,7 +5,8 @@ import functools
 
 import warp as wp
 
-from wavefront.accel.mesh_query import Geometry, hit_type, make_intersector
+from wavefront.accel.geometry import Geometry, hit_type
+from wavefront.accel.intersector import make_intersector
 from wavefront.bsdf.dispatch import is_smooth, make_bsdf
 from wavefront.bsdf.frame import make_frame
 from wavefront.bsdf.tables import MaterialTables
@@ -18,9 +19,9 @@ from wavefront.texture import TextureTables
 
 
 @functools.cache
-def make_inspect_hit(triangles: bool, spheres: bool, instances: tuple[str, ...]):
+def make_inspect_hit(triangles: bool, spheres: bool, instances: tuple[str, ...], accel: str):
     """Kernel that finds the primitive which the ray in slot 0 meets; the arguments are fields of `Features`."""
-    closest_hit, _ = make_intersector(triangles, spheres, instances)
+    closest_hit = make_intersector(triangles, spheres, instances, accel).closest_hit
     AnyHit = hit_type(instances)
 
     @wp.kernel(enable_backward=False, module="unique")
