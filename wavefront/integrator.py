@@ -243,6 +243,7 @@ class Worker:
             for struct in (Paths, TriangleHits, Surfaces, ShadowRays)
         )
         self.paths, self.surfaces, self.shadow_rays = paths, surfaces, shadow_rays
+        self.triangle_hits = triangle_hits
         geometry, materials = device_scene.geometry, device_scene.materials
         textures, lights = device_scene.textures, device_scene.lights
         rays, hits, escaped, emissive, shadow = (

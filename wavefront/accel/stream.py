@@ -12,7 +12,7 @@ The C++ uses the vector types of Clang, which compiles kernels for the CPU devic
 import warp as wp
 
 from wavefront.accel.bvh import BLOCK_VECTORS, MAX_BLOCKS, NODE_VECTORS, STACK_SIZE, Bvh
-from wavefront.accel.traverse import FAR_SLACK, STEEPEST
+from wavefront.accel.traverse import FAR_SLACK, NEAR_SLACK, STEEPEST
 
 IN_FLIGHT = 16  # rays; 4 gain half of what 16 do on a million triangles, and more little (README, bench_accel)
 
@@ -72,7 +72,7 @@ _STREAM = """
             r.o[k] = o[k];
             const bool along = __builtin_fabsf(d[k]) < 1.0f / STEEPEST;
             const float slope = along ? __builtin_copysignf(STEEPEST, d[k]) : 1.0f / d[k];
-            r.near_slope[k] = slope;
+            r.near_slope[k] = slope * NEAR_SLACK;
             r.far_slope[k] = slope * FAR_SLACK;
             r.near_side[k] = 8 * k + (slope < 0.0f ? 24 : 0);
             r.far_side[k] = 8 * k + (slope < 0.0f ? 0 : 24);
@@ -93,6 +93,11 @@ _STREAM = """
         r.size = 0;
         r.link = root;
         return true;
+    };
+    // Of a triangle with a corner at the origin: ax by - ay bx, see `difference_of_products`.
+    auto twice_area = [](float4 ax, float4 ay, float4 bx, float4 by) -> float4 {
+        const float4 product = ay * bx;
+        return __builtin_elementwise_fma(ax, by, -product) + __builtin_elementwise_fma(-ay, bx, product);
     };
     while (active < IN_FLIGHT && begin(rays[active])) ++active;
     while (active > 0) {
@@ -133,18 +138,9 @@ _STREAM = """
                     const float4 by = (*(const float4*)(block + 12 + ky) - oy) - r.shear_y * bz;
                     const float4 cx = (*(const float4*)(block + 24 + kx) - ox) - r.shear_x * cz;
                     const float4 cy = (*(const float4*)(block + 24 + ky) - oy) - r.shear_y * cz;
-                    float4 u = cx * by - cy * bx, v = ax * cy - ay * cx, w = bx * ay - by * ax;
-                    const int4 zero = (u == 0.0f) | (v == 0.0f) | (w == 0.0f);
-                    if (__builtin_expect(__builtin_reduce_or(zero), 0)) {
-                        auto edge = [](float x, float y, float p, float q) {
-                            return (float)((double)x * (double)y - (double)p * (double)q);
-                        };
-                        for (int i = 0; i < 4; ++i) {
-                            if (u[i] == 0.0f) u[i] = edge(cx[i], by[i], cy[i], bx[i]);
-                            if (v[i] == 0.0f) v[i] = edge(ax[i], cy[i], ay[i], cx[i]);
-                            if (w[i] == 0.0f) w[i] = edge(bx[i], ay[i], by[i], ax[i]);
-                        }
-                    }
+                    const float4 u = twice_area(cx, cy, bx, by);
+                    const float4 v = twice_area(ax, ay, cx, cy);
+                    const float4 w = twice_area(bx, by, ax, ay);
                     const int4 front = (u >= 0.0f) & (v >= 0.0f) & (w >= 0.0f);
                     const int4 back = (u <= 0.0f) & (v <= 0.0f) & (w <= 0.0f);
                     if (!__builtin_reduce_or(front | back)) continue;
@@ -206,6 +202,7 @@ def _stream(source: str, found: str, result: str) -> str:
         "NODE_VECTORS": NODE_VECTORS,
         "BLOCK_VECTORS": BLOCK_VECTORS,
         "MAX_BLOCKS": MAX_BLOCKS,
+        "NEAR_SLACK": f"{float(NEAR_SLACK)}f",
         "FAR_SLACK": f"{float(FAR_SLACK)}f",
         "STEEPEST": f"{float(STEEPEST)}f",
     }
