@@ -145,15 +145,16 @@ _STREAM = """
                     const int4 back = (u <= 0.0f) & (v <= 0.0f) & (w <= 0.0f);
                     if (!__builtin_reduce_or(front | back)) continue;
                     const float4 det = u + v + w;
-                    const float4 t = r.shear_z * (u * az + v * bz + w * cz) / det;
+                    const float4 weight_a = u / det, weight_b = v / det;
+                    const float4 t = r.shear_z * (weight_a * az + weight_b * bz + (w / det) * cz);
                     const int4 met = (front | back) & (det != 0.0f) & (t > 0.0f) & (t <= r.t);
                     if (!__builtin_reduce_or(met)) continue;
                     for (int i = 0; i < 4; ++i) {
                         const int primitive = ((const int*)(block + 36))[i];
                         if (met[i] && (t[i] < r.t || (t[i] == r.t && primitive < r.primitive))) {
                             r.t = t[i];
-                            r.u = u[i] / det[i];
-                            r.v = v[i] / det[i];
+                            r.u = weight_a[i];
+                            r.v = weight_b[i];
                             r.primitive = primitive;
                             FOUND
                         }

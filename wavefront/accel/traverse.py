@@ -9,9 +9,12 @@ import warp as wp
 from wavefront.accel.bvh import BLOCK, BLOCK_VECTORS, MAX_BLOCKS, NODE_VECTORS, STACK_SIZE, Bvh, Extents
 from wavefront.accel.collapse import WIDTH
 
-STEEPEST = wp.constant(1.0e18)  # slope of a direction along a plane: distances remain finite
-# Relative slack of the sides of a box: three roundings of the slab test (Ize 2013), and those of the triangle test. With
-# it the box of a triangle is not behind it, and of triangles at all but one distance the order of visits chooses none.
+# Slope of a direction along a plane: finite, for 0 times infinity is no distance, and so great that even 1e-17 m, such
+# as roundings leave of a zero, times it is beyond all hits.
+STEEPEST = wp.constant(8.0e37)
+# Relative slack of the sides of a box: three roundings of the slab test (Ize 2013), and those of the triangle test.
+# With it the box of a triangle is not behind it, and of triangles at all but one distance the order of visits chooses
+# none.
 NEAR_SLACK = wp.constant(0.999998)
 FAR_SLACK = wp.constant(1.000002)
 
@@ -135,14 +138,17 @@ def test_triangle(bvh: Bvh, block: int, k: int, origin: wp.vec3, shear: Shear, n
     inside = (u >= 0.0 and v >= 0.0 and w >= 0.0) or (u <= 0.0 and v <= 0.0 and w <= 0.0)
     det = u + v + w
     if inside and det != 0.0:
-        t = shear.z * (u * az + v * bz + w * cz) / det
+        # Weights first: products of three lengths leave the range of float32 at 1e12.
+        u /= det
+        v /= det
+        t = shear.z * (u * az + v * bz + (w / det) * cz)
         if t > 0.0 and t <= hit.t:
             primitive = bvh.primitives[block + 9][k]
             if t < hit.t or primitive < hit.primitive:
                 hit.t = t
                 hit.primitive = primitive
-                hit.u = u / det
-                hit.v = v / det
+                hit.u = u
+                hit.v = v
     return hit
 
 
