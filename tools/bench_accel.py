@@ -12,7 +12,8 @@ alone. "wp.Mesh" is built by its SAH constructor with leaves of 1, 2, 4 and 8 tr
 least time over all. "embree" is Embree 4 through embreex, which traces one ray after the other on one thread, whatever
 --threads says. "mitsuba" is Mitsuba 3 in the variant llvm_ad_rgb, which traces packets with an Embree of its own.
 Neither Embree is asked to be watertight. Threads in use are processor time over time: less than --threads means that
-the engine waited or the machine was busy. Resident memory is what the process grew by while it built.
+the engine waited or the machine was busy; rays per second of processor time are less disturbed by that. Resident memory
+is what the process grew by while it built.
 """
 
 from __future__ import annotations
@@ -25,7 +26,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-import warp as wp
 from rich.console import Console
 from rich.table import Table
 
@@ -36,6 +36,7 @@ from tools.bench_common import machine, spread
 from tools.guide_figure import need_matplotlib
 from wavefront.errors import WavefrontError
 from wavefront.output import check_writable
+from wavefront.renderer import resolve_device
 from wavefront.scene.images import replacing
 
 QUERIES = ("closest", "any")
@@ -93,14 +94,16 @@ def bench_build(structure: Structure, case: Case, rounds: int, device: str) -> d
     grown = None
     while len(seconds) < rounds and sum(seconds) < BUILD_SECONDS:
         structure.release()
-        gc.collect()
-        before = memory_in_use(device) if not seconds else None
+        before = None
+        if not seconds and len(case.faces) >= MEMORY_FROM:
+            gc.collect()
+            before = memory_in_use(device)
         clock = Clock()
         structure.build()
         wall, busy = clock.read()
         seconds.append(wall)
         cpu.append(busy)
-        if before is not None and len(case.faces) >= MEMORY_FROM:
+        if before is not None:
             gc.collect()
             grown = (memory_in_use(device) - before) / len(case.faces)
     statistics = structure.statistics()
@@ -181,8 +184,10 @@ def summarise(account: dict) -> None:
         for kind, sorts in engine["measured"].items():
             for measured in sorts.values():
                 seconds = measured["seconds"]
-                wall, cpu = wall + sum(seconds), cpu + sum(measured.pop("cpu_seconds"))
+                busy = measured.pop("cpu_seconds")
+                wall, cpu = wall + sum(seconds), cpu + sum(busy)
                 measured["mrays_per_second"] = spread([account["rays"][kind] / s / 1e6 for s in seconds])
+                measured["mrays_per_cpu_second"] = spread([account["rays"][kind] / s / 1e6 for s in busy])
                 measured["seconds"] = spread(seconds)
                 total += measured["seconds"]["median"]
         engine["threads_in_use"] = cpu / wall
@@ -237,7 +242,8 @@ def query_table(account: dict) -> Table:
     for kind in kinds:
         for sort in QUERIES:
             table.add_column(f"{kind}\n{sort}", justify="right", no_wrap=True)
-    for name in (f"{first} / this:\nbounce, closest", "threads\nin use", "answers\ndiffer", "first\nruns, s"):
+    names = (f"{first}/this:\nbounce", "per CPU s:\nbounce", "threads\nin use", "answers\ndiffer", "first\nruns, s")
+    for name in names:
         table.add_column(name, justify="right")
     for name, engine in account["engines"].items():
         cells = [engine["measured"][kind][sort] for kind in kinds for sort in QUERIES]
@@ -245,6 +251,7 @@ def query_table(account: dict) -> Table:
             name + (" (best)" if name == account["best_mesh"] else ""),
             *("{median:.3g} ({max:.3g})".format(**cell["mrays_per_second"]) for cell in cells),
             f"{engine['measured']['bounce']['closest']['first_over_this']['median']:.2f}",
+            f"{engine['measured']['bounce']['closest']['mrays_per_cpu_second']['median']:.3g}",
             f"{engine['threads_in_use']:.2f}",
             str(sum(cell["differences"] for cell in cells)),
             f"{engine['warm_up_seconds']:.2f}",
@@ -315,11 +322,10 @@ def check(arguments: argparse.Namespace) -> None:
             raise WavefrontError(f"--{name} {getattr(arguments, name)}; allowed: {least} or more")
     if not (arguments.scenes or arguments.sizes or arguments.soup):
         raise WavefrontError("there is nothing to measure: no scene, no --sizes and no --soup")
-    if arguments.device != "cpu":
-        try:
-            wp.get_device(arguments.device)
-        except ValueError as error:
-            raise WavefrontError(f"--device {arguments.device}: {error}") from None
+    for path in arguments.scenes:
+        if not path.is_file():
+            raise WavefrontError(f"{path}: file not found")
+    arguments.device = resolve_device(arguments.device)
     if arguments.plot:
         need_matplotlib()
         if len(set(arguments.sizes)) < 2:
@@ -361,7 +367,7 @@ def run(arguments: argparse.Namespace) -> int:
     for make in makers:
         account["cases"].append(bench_case(make(), structures, arguments, progress))
     # A pipe or a file has no width; the widest table needs this much.
-    print_report(account, Console(width=None if sys.stdout.isatty() else 160, highlight=False))
+    print_report(account, Console(width=None if sys.stdout.isatty() else 170, highlight=False))
     if arguments.json:
         with replacing(arguments.json) as temporary:
             temporary.write_text(json.dumps(account, indent=2) + "\n", encoding="utf-8")
