@@ -367,7 +367,7 @@ def run(arguments: argparse.Namespace) -> int:
     for make in makers:
         account["cases"].append(bench_case(make(), structures, arguments, progress))
     # A pipe or a file has no width; the widest table needs this much.
-    print_report(account, Console(width=None if sys.stdout.isatty() else 170, highlight=False))
+    print_report(account, Console(width=None if sys.stdout.isatty() else 180, highlight=False))
     if arguments.json:
         with replacing(arguments.json) as temporary:
             temporary.write_text(json.dumps(account, indent=2) + "\n", encoding="utf-8")
