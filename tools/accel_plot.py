@@ -57,8 +57,8 @@ def write_plot(path: Path, account: dict) -> None:
     _draw(axes[1, 0], costs, "building", "µs a triangle, median")
     memory = _curves(cases, "structures", structures, per_triangle("resident_bytes_per_triangle"))
     exact = _curves(cases, "structures", structures, per_triangle("bytes_per_triangle"))
-    memory = {f"{name}, growth of the process": curve for name, curve in memory.items()}
-    _draw(axes[1, 1], memory | exact, "memory", "bytes a triangle", logarithmic=False)
+    memory |= {f"{name}, its arrays": curve for name, curve in exact.items()}
+    _draw(axes[1, 1], memory, "memory by which the process grows", "bytes a triangle", logarithmic=False)
     sah = _curves(cases, "structures", structures, lambda e: e["statistics"] and e["statistics"]["sah_cost"])
     _draw(axes[1, 2], sah, "SAH cost", "node visits, weighted with blocks", logarithmic=False)
     machine, settings = account["machine"], account["settings"]

@@ -81,6 +81,19 @@ class Clock:
         return time.perf_counter() - self.begin, time.process_time() - self.begin_cpu
 
 
+def settle(step: float = 0.01, limit: float = 1.0) -> None:
+    """Waits until no thread of this process runs: those of Mitsuba still look for work for some ms after theirs.
+
+    Linux counts the time of other threads by its ticks, of up to 10 ms, and so a shorter step may see none.
+    """
+    for _ in range(round(limit / step)):
+        clock = Clock()
+        time.sleep(step)
+        wall, cpu = clock.read()
+        if cpu < 0.25 * wall:
+            return
+
+
 def bench_build(structure: Structure, case: Case, rounds: int, device: str) -> dict:
     """Builds a hierarchy and leaves it built; returns the account of it."""
     tiny = generated(WARM_UP)
@@ -98,6 +111,7 @@ def bench_build(structure: Structure, case: Case, rounds: int, device: str) -> d
         if not seconds and len(case.faces) >= MEMORY_FROM:
             gc.collect()
             before = memory_in_use(device)
+        settle()
         clock = Clock()
         structure.build()
         wall, busy = clock.read()
@@ -163,6 +177,7 @@ def bench_case(case: Case, structures: list[Structure], arguments: argparse.Name
         for (kind, sort), engines in queries.items():
             order = list(engines.items())
             for engine, query in order if number % 2 == 0 else order[::-1]:
+                settle()
                 clock = Clock()
                 query.run()
                 wall, cpu = clock.read()
