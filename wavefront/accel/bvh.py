@@ -166,7 +166,7 @@ class Statistics:
         sah_cost: Expected nodes and blocks of leaves that a random line which meets the root's box visits, weighted by
             `NODE_COST` and `BLOCK_COST`.
         node_visits, block_visits: The same apart and without weights.
-        bytes: Of device memory that stays.
+        bytes: Of device memory that stays: tables, and what refitting reads.
         seconds: To build it.
     """
 
@@ -245,7 +245,7 @@ class _Hierarchy:
             sah_cost=NODE_COST * node_visits + BLOCK_COST * block_visits,
             node_visits=node_visits,
             block_visits=block_visits,
-            bytes=16 * vectors,
+            bytes=16 * vectors + sum(a.capacity for a in (self.wide.links, self.wide.block_ranges, self.wide.order)),
             seconds=self.build_seconds,
         )
 

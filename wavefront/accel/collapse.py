@@ -268,4 +268,5 @@ def collapse(binary: BinaryTree, block: int, max_blocks: int) -> WideTree:
         levels.append(levels[-1] + next_count)
         block_count += next_blocks
     del levels[-1]
-    return WideTree(links[: levels[-1]], levels, block_ranges[:block_count], order)
+    # Copies, for views would keep the whole of the arrays, most of which is unused.
+    return WideTree(wp.clone(links[: levels[-1]]), levels, wp.clone(block_ranges[:block_count]), order)
