@@ -15,6 +15,7 @@ from wavefront.light.tables import LightTables
 from wavefront.queues import DEPTH, Paths, Surfaces
 from wavefront.rng import PURPOSE_LIGHT
 from wavefront.sampler import SAMPLERS
+from wavefront.stage_kernel import stage_kernel
 from wavefront.texture import TextureTables
 
 
@@ -24,7 +25,7 @@ def make_inspect_hit(triangles: bool, spheres: bool, instances: tuple[str, ...],
     closest_hit = make_intersector(triangles, spheres, instances, accel).closest_hit
     AnyHit = hit_type(instances)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def inspect_hit(
         geometry: Geometry,
         paths: Paths,
@@ -46,7 +47,7 @@ def make_inspect_light(lights: tuple[str, ...], light_textures: tuple[str, ...],
     sample_light, _ = make_light_sampler(lights, light_textures)
     draw = SAMPLERS[sampler]
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def inspect_light(
         geometry: Geometry,
         materials: MaterialTables,
@@ -79,7 +80,7 @@ def make_inspect_bsdf(
     eval_bsdf, _, _ = make_bsdf(bsdfs, mask, textures, tangents, bool(maps))
     frame_at, _ = make_frame(tangents, bool(maps))
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def inspect_bsdf(
         materials: MaterialTables,
         textures: TextureTables,

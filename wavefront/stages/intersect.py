@@ -10,6 +10,7 @@ from wavefront.accel.geometry import INFINITE, Geometry, hit_type
 from wavefront.accel.intersector import make_intersector
 from wavefront.medium import transmittance
 from wavefront.queues import DEPTH, Paths, Queue, Surfaces, TriangleHits, push, queue_size
+from wavefront.stage_kernel import stage_kernel
 from wavefront.surface import make_vertex
 
 
@@ -38,7 +39,7 @@ def make_intersect(
     traced = triangles and streams
     vertex_of = make_vertex(triangles, spheres, smooth, uvs, tangents, bumps, instances)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def closest_hits(
         geometry: Geometry,
         paths: Paths,  # also out, where a medium absorbs

@@ -9,6 +9,7 @@ import warp as wp
 from wavefront.accel.geometry import Geometry
 from wavefront.accel.intersector import make_intersector
 from wavefront.queues import Paths, Queue, ShadowRays, queue_size
+from wavefront.stage_kernel import stage_kernel
 
 
 @functools.cache
@@ -24,7 +25,7 @@ def make_shadow(
     occluded, occluded_by_other = intersector.occluded, intersector.occluded_by_other
     traced = triangles and streams
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def trace_shadow_rays(
         geometry: Geometry,
         shadow_rays: ShadowRays,

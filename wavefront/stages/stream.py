@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warp as wp
-
 from wavefront.accel.geometry import Geometry
 from wavefront.accel.stream import any_triangles, closest_triangles
 from wavefront.queues import Paths, Queue, ShadowRays, TriangleHits, queue_size
+from wavefront.stage_kernel import stage_kernel
 
 
-@wp.kernel(enable_backward=False, module="unique")
+@stage_kernel
 def stream_rays(
     geometry: Geometry,
     paths: Paths,
@@ -31,7 +30,7 @@ def stream_rays(
     )
 
 
-@wp.kernel(enable_backward=False, module="unique")
+@stage_kernel
 def stream_shadow_rays(
     geometry: Geometry,
     shadow: Queue,
