@@ -92,7 +92,9 @@ def check_tree(hierarchy, lower, upper, first: int = 0, block: int = 4, max_bloc
     assert statistics.leaves == leaf.sum() == len(found.leaves)
     assert statistics.levels == found.levels <= bvh_module.MAX_LEVELS
     assert hierarchy.block_count == blocks.sum()
-    assert statistics.bytes == 256 * len(found.nodes) + (160 if block == 4 else 16) * blocks.sum()
+    traced = 256 * len(found.nodes) + (160 if block == 4 else 16) * blocks.sum()
+    refitted = 32 * len(found.nodes) + 8 * blocks.sum() + 4 * len(lower)
+    assert statistics.bytes == traced + refitted
     assert statistics.seconds > 0.0
     root = half_area(lower.min(axis=0).astype(np.float64), upper.max(axis=0).astype(np.float64))
     if root > 0.0:
