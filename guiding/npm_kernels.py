@@ -13,6 +13,7 @@ from wavefront.queues import DEPTH, Paths, Queue, Surfaces, queue_size
 from wavefront.recording import RecordArrays
 from wavefront.rng import PURPOSE_GUIDE
 from wavefront.sampler import SAMPLERS
+from wavefront.stage_kernel import stage_kernel
 
 _INV_PI = wp.constant(1.0 / math.pi)
 _SMALLEST_COSINE = wp.constant(1.0e-4)  # f = (f cos) / cos is not known below; such records do not train
@@ -73,7 +74,7 @@ def make_kernels(product: bool, cosine_aware: bool, learned_share: bool, sampler
     Mixture = mixture.Mixture
     draw = SAMPLERS[sampler]
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def gather_vertices(
         paths: Paths,
         surfaces: Surfaces,
@@ -95,7 +96,7 @@ def make_kernels(product: bool, cosine_aware: bool, learned_share: bool, sampler
             roughness = proposals.roughness[slot]
         write_inputs(x, i, surfaces.position[slot], normal, wo, roughness, proposals.transmits[slot], origin, scale)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def decode_mixtures(
         paths: Paths,
         surfaces: Surfaces,
@@ -121,7 +122,7 @@ def make_kernels(product: bool, cosine_aware: bool, learned_share: bool, sampler
         if wp.static(learned_share):
             proposals.share[slot] = sigmoid(share_offset + raw[i, n_params])
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def draw_directions(
         paths: Paths,
         proposed: Queue,
@@ -138,7 +139,7 @@ def make_kernels(product: bool, cosine_aware: bool, learned_share: bool, sampler
         u = draw(seed, paths.pixel[slot], paths.sample[slot], counters[DEPTH], PURPOSE_GUIDE)
         proposals.wi[slot] = sample(mixtures[slot], wp.vec3(u[0], u[1], u[2]))
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def evaluate_directions(
         queue: Queue,
         mixtures: wp.array[Mixture],
@@ -160,7 +161,7 @@ def make_training(product: bool, mis_aware: bool, product_cosine: bool, vertex_l
     """Kernels of training: `weigh_records` and `gather_batch`; the arguments as in `NpmSettings`."""
     write_inputs = make_write_inputs(product)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def weigh_records(
         records: RecordArrays,
         bsdf_share: float,
@@ -192,7 +193,7 @@ def make_training(product: bool, mis_aware: bool, product_cosine: bool, vertex_l
                 weight *= (1.0 - bsdf_share) * records.guide_pdf[i] / pdf
         weights[i] = wp.where(wp.isfinite(weight), weight, 0.0)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def gather_batch(
         records: RecordArrays,
         weights: wp.array[wp.float32],
@@ -256,7 +257,7 @@ def brightness(cells: wp.array[wp.float64], cells_per_axis: int, cell: int) -> f
     return wp.where(value > wp.float64(0.0), wp.float32(value), 1.0)
 
 
-@wp.kernel(enable_backward=False, module="unique")
+@stage_kernel
 def sum_brightness(
     position: wp.array[wp.vec3],
     weights: wp.array[wp.float32],
@@ -361,7 +362,7 @@ def make_query(product: bool, cosine_aware: bool, mixture: VmfMixture):
     write_inputs = make_write_inputs(product)
     decode, multiply, pdf = mixture.decode, mixture.multiply, mixture.pdf
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def fill_inputs(
         position: wp.vec3,
         normal: wp.vec3,
@@ -375,7 +376,7 @@ def make_query(product: bool, cosine_aware: bool, mixture: VmfMixture):
     ):
         write_inputs(x, 0, position, normal, wo, roughness, through, origin, scale)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def evaluate_query(
         raw: wp.array[wp.float32],
         normal: wp.vec3,

@@ -13,7 +13,8 @@ import functools
 import numpy as np
 import warp as wp
 
-from wavefront.accel.mesh_query import INFINITE, Geometry, make_intersector
+from wavefront.accel.geometry import INFINITE, Geometry
+from wavefront.accel.intersector import make_intersector
 from wavefront.bsdf.dispatch import is_smooth, make_bsdf
 from wavefront.bsdf.frame import ShadingFrame
 from wavefront.bsdf.maps import make_mapped_frame
@@ -78,7 +79,7 @@ def make_megakernel(
 ):
     """Only what a scene lacks memory for is left out: kinds of primitive, vertex normals, UVs, tables of sampling."""
     perspective, thin_lens, orthographic, spherical = (make_camera_ray(kind) for kind in CAMERAS)
-    closest_hit, occluded = make_intersector(triangles, spheres, instances)
+    closest_hit, occluded = make_intersector(triangles, spheres, instances)[:2]
     vertex_of = make_vertex(triangles, spheres, smooth, uvs, tangents, maps, instances)
     eval_bsdf, sample_bsdf, _ = make_bsdf(tuple(sorted(BSDF_KINDS)), True, TEXTURES, tangents, maps)
     mapped_frame = make_mapped_frame(TEXTURES, True)

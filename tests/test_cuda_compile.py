@@ -21,6 +21,8 @@ CORNELL_BOX = Features(
     triangles=True,
     spheres=False,
     instances=(),
+    accel="bvh",
+    streams=False,
     smooth=False,
     uvs=False,
     tangents=False,
@@ -43,6 +45,8 @@ EVERYTHING = Features(
     triangles=True,
     spheres=True,
     instances=("spheres", "triangles"),
+    accel="bvh",
+    streams=False,
     smooth=True,
     uvs=True,
     tangents=True,
@@ -91,7 +95,7 @@ def compile_for_cuda(features: Features, arch: int, folder) -> int:
 def inspectors(f: Features) -> list:
     """Modules of the kernels of a traced path."""
     kernels = [
-        make_inspect_hit(f.triangles, f.spheres, f.instances),
+        make_inspect_hit(f.triangles, f.spheres, f.instances, f.accel),
         make_inspect_bsdf(f.bsdfs, f.mask, f.textures, f.uvs, f.tangents, f.maps),
     ]
     if f.light_sampling:

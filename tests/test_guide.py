@@ -140,7 +140,7 @@ def test_with_all_samples_from_the_bsdf_media_change_roundings():
 def test_nothing_of_guiding_without_a_guide():
     scene = load("cornell-box")
     plain, guided = Renderer(scene, threads=1), Renderer(scene, threads=1, guide=LobeGuide())
-    assert plain.bytes_per_path == 164 < guided.bytes_per_path
+    assert plain.bytes_per_path == 184 < guided.bytes_per_path
     assert not plain.features.guided
     for name in ("guided", "lit", "proposed", "smooth"):
         assert plain.workers[0].queues[name].slots.shape[0] == 0
@@ -178,7 +178,7 @@ def test_bytes_per_path_are_what_is_allocated(guide, nee):
     """The state of the guide itself included."""
     r = Renderer(load("coloured-glass", f"integrator.nee={nee}"), threads=1, guide=guide())
     w = r.workers[0]
-    structs = [w.paths, w.surfaces, w.shadow_rays, w.proposals, w.light_proposals, w.scratch]
+    structs = [w.paths, w.triangle_hits, w.surfaces, w.shadow_rays, w.proposals, w.light_proposals, w.scratch]
     arrays = [getattr(struct, name) for struct in structs for name in struct._cls.vars]
     arrays += [queue.slots for queue in w.queues.queues.values()]
     arrays += [array for array in vars(w.state).values() if isinstance(array, wp.array)]

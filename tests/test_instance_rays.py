@@ -15,15 +15,17 @@ from tests.test_surface import (
     shapes,
     unit,
 )
+from wavefront.accel.bvh import BoxBvh
+from wavefront.accel.geometry import Geometry, InstanceHit
 from wavefront.accel.instance import Group, Instance
-from wavefront.accel.mesh_query import Geometry, InstanceHit, make_intersector
+from wavefront.accel.intersector import make_intersector
 from wavefront.surface import Vertex, make_vertex, spawn_origin
 
 N = 40_000
 CHUNK = 200  # triangles of one group
 KINDS = ("spheres", "triangles")
 
-closest, occluded = make_intersector(False, False, KINDS)
+closest, occluded = make_intersector(False, False, KINDS)[:2]
 vertex_of = make_vertex(False, False, True, True, False, False, KINDS)
 
 
@@ -82,7 +84,6 @@ class World(Soup):
         identity = np.tile(np.eye(3, dtype=np.float32), (len(self.spheres), 1, 1))
         g.sphere_to_local = wp.array(identity, dtype=wp.mat33, device=DEVICE)
         group = Group()
-        group.mesh = self.mesh.id
         if len(self.spheres):
             grown = 1.0001 * self.spheres[:, 3:] + 1e-5 * np.abs(self.spheres[:, :3]).max(axis=1, keepdims=True)
             corners = (self.spheres[:, :3] + sign * grown for sign in (-1.0, 1.0))
@@ -95,8 +96,7 @@ class World(Soup):
         g.instances = wp.array(host, dtype=Instance, device=DEVICE)
         self.matrices, self.translations = (host[name].astype(np.float64) for name in ("to_world", "translation"))
         huge = wp.array(np.full((len(matrices), 3), 1e30), dtype=wp.vec3, device=DEVICE)
-        self.boxes = wp.Bvh(wp.array(-huge.numpy(), dtype=wp.vec3, device=DEVICE), huge)
-        g.instance_bvh = self.boxes.id
+        g.instance_bvh = BoxBvh(wp.array(-huge.numpy(), dtype=wp.vec3, device=DEVICE), huge).bvh
 
     def launch(self, kernel, inputs, outputs):
         n = len(inputs[-1])

@@ -9,7 +9,7 @@ import pytest
 
 from tests.megakernel import render_megakernel
 from wavefront import Renderer
-from wavefront.accel.mesh_query import hit_type
+from wavefront.accel.geometry import hit_type
 from wavefront.errors import SceneError
 from wavefront.scene import description as d
 from wavefront.scene import json_format, load_scene, validate

@@ -4,15 +4,17 @@ import numpy as np
 import pytest
 import warp as wp
 
-from wavefront.accel.mesh_query import Geometry, Hit, Shape, make_intersector
+from wavefront.accel.bvh import TriangleBvh
+from wavefront.accel.geometry import Geometry, Hit, Shape
+from wavefront.accel.intersector import make_intersector
 from wavefront.surface import Vertex, make_vertex, spawn_origin
 
 DEVICE = "cpu"
 N = 100_000
 CHUNK = 200  # triangles in one mesh: a cloud of all scales overlaps too much for a large hierarchy
 
-closest_triangle, _ = make_intersector(True, False)
-closest_sphere, _ = make_intersector(False, True)
+closest_triangle = make_intersector(True, False).closest_hit
+closest_sphere = make_intersector(False, True).closest_hit
 triangle_vertex = make_vertex(True, False, True, True, True, True)
 sphere_vertex = make_vertex(False, True, False, True, True, True)
 
@@ -82,8 +84,7 @@ class Soup:
         g.uvs = wp.array(np.ascontiguousarray(uvs, np.float32).reshape(-1, 2), dtype=wp.vec2, device=DEVICE)
         g.shape_of = wp.array(np.zeros(count) if shape_of is None else shape_of, dtype=wp.int32, device=DEVICE)
         g.shapes = shapes(2, smooth=[0, 1])
-        self.mesh = wp.Mesh(g.points, g.indices, bvh_constructor="sah", bvh_leaf_size=4)
-        g.mesh = self.mesh.id
+        g.bvh = TriangleBvh(g.points, g.indices).bvh
 
     def leave(self, primitive, u, v, direction):
         n = len(primitive)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from wavefront.accel.mesh_query import Geometry, make_intersector
+from wavefront.accel.geometry import Geometry
+from wavefront.accel.intersector import make_intersector
 from wavefront.scene import description as d
 from wavefront.scene.device import upload_scene
 from wavefront.surface import Vertex, make_vertex
@@ -19,7 +20,7 @@ TURN = [d.TransformStep(rotate=d.Rotate(axis=(1.0, 2.0, 3.0), angle=70.0)), d.Tr
 
 @functools.cache
 def make_kernel(spheres: bool, smooth: bool):
-    closest_hit, _ = make_intersector(not spheres, spheres)
+    closest_hit = make_intersector(not spheres, spheres).closest_hit
     vertex_of = make_vertex(not spheres, spheres, smooth, True, True, True)
 
     @wp.kernel(enable_backward=False, module="unique")

@@ -17,7 +17,7 @@ from pathlib import Path
 from wavefront.errors import WavefrontError
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("wavefront", "warp-lang", "numpy", "mitsuba", "drjit", "torch")
+PACKAGES = ("wavefront", "warp-lang", "numpy", "embreex", "mitsuba", "drjit", "torch")
 
 
 def machine() -> dict:

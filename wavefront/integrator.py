@@ -23,7 +23,7 @@ from wavefront.features import Features
 from wavefront.film import FIRST_HIT, Film, film_arrays, make_window
 from wavefront.guide import Guide
 from wavefront.proposals import INPUTS, LightProposals, Proposals
-from wavefront.queues import Paths, QueueSet, ShadowRays, Surfaces, allocate_struct, bytes_per_slot
+from wavefront.queues import Paths, QueueSet, ShadowRays, Surfaces, TriangleHits, allocate_struct, bytes_per_slot
 from wavefront.recording import RecordScratch, scratch_arrays
 from wavefront.scene import description
 from wavefront.scene.device import DeviceScene
@@ -38,6 +38,7 @@ from wavefront.stages.intersect import make_intersect
 from wavefront.stages.perturb import make_perturb
 from wavefront.stages.scatter import make_scatter
 from wavefront.stages.shadow import make_shadow
+from wavefront.stages.stream import stream_rays, stream_shadow_rays
 
 FILTER_SCALES = {"box": lambda f: 0.5, "tent": lambda f: f.radius, "gaussian": lambda f: f.stddev}
 
@@ -50,9 +51,11 @@ def make_features(scene: description.Scene, device_scene: DeviceScene, guide: Gu
     """What the kernels for a scene, its settings and a guide must do, and no more."""
     integrator = scene.integrator
     return Features(
-        triangles=bool(device_scene.geometry.mesh),
+        triangles=device_scene.geometry.root >= 0,
         spheres=bool(device_scene.geometry.sphere_bvh),
         instances=device_scene.instances,
+        accel=device_scene.accel,
+        streams=device_scene.streams and device_scene.geometry.root >= 0,
         smooth=device_scene.smooth,
         uvs=bool(device_scene.texture_kinds) or "uv" in scene.film.aovs,
         tangents=device_scene.tangents,
@@ -83,12 +86,14 @@ class Kernels:
     """The kernels of all stages; None where there is no such stage. `wavefront.guided` has more."""
 
     generate: wp.Kernel
+    stream: wp.Kernel | None
     intersect: wp.Kernel
     perturb: wp.Kernel | None
     escaped: wp.Kernel | None
     emission: wp.Kernel | None
     aov: wp.Kernel | None
     direct: wp.Kernel | None
+    stream_shadow: wp.Kernel | None
     shadow: wp.Kernel | None
     drain: wp.Kernel
     scatter: wp.Kernel | None
@@ -104,6 +109,7 @@ def make_kernels(f: Features) -> Kernels:
     """Kernels for a set of features; scenes that agree in what a stage reads share its kernel."""
     return Kernels(
         generate=make_generate(f.camera, f.filter, f.transmission, f.sampler),
+        stream=stream_rays if f.streams else None,
         intersect=make_intersect(
             f.triangles,
             f.spheres,
@@ -116,6 +122,8 @@ def make_kernels(f: Features) -> Kernels:
             "shape_index" in f.aovs,
             f.media,
             f.instances,
+            f.accel,
+            f.streams,
         ),
         perturb=make_perturb(f.textures, f.uvs, "bump" in f.maps) if f.maps else None,
         escaped=make_escaped(f.escape_lights, f.light_sampling) if f.escape_lights else None,
@@ -126,7 +134,8 @@ def make_kernels(f: Features) -> Kernels:
         )
         if f.light_sampling and not f.guided
         else None,
-        shadow=make_shadow(f.triangles, f.spheres, f.instances) if f.light_sampling else None,
+        stream_shadow=stream_shadow_rays if f.streams and f.light_sampling else None,
+        shadow=make_shadow(f.triangles, f.spheres, f.instances, f.accel, f.streams) if f.light_sampling else None,
         drain=drain_rays,
         scatter=make_scatter(
             f.bsdfs, f.mask, f.textures, f.uvs, f.tangents, f.maps, f.transmission, f.roulette, f.media, f.sampler
@@ -153,7 +162,8 @@ def skipped_arrays(f: Features) -> dict[type, tuple[str, ...]]:
     return {
         Paths: (() if f.transmission else ("eta",)) + (() if f.media else ("medium",)),
         Surfaces: tuple(name for name, used in surface_arrays.items() if not used),
-        ShadowRays: () if f.light_sampling else tuple(ShadowRays.vars),
+        TriangleHits: () if f.streams else tuple(TriangleHits.vars),
+        ShadowRays: (() if f.streams else ("blocked",)) if f.light_sampling else tuple(ShadowRays.vars),
     }
 
 
@@ -228,10 +238,12 @@ class Worker:
         self.queues = QueueSet(capacity, device, queue_names(features))
         self.tile = wp.zeros(queues.TILE_FIELDS, dtype=wp.int32, device=device)
         skip = skipped_arrays(features)
-        paths, surfaces, shadow_rays = (
-            allocate_struct(struct, capacity, device, skip[struct]) for struct in (Paths, Surfaces, ShadowRays)
+        paths, triangle_hits, surfaces, shadow_rays = (
+            allocate_struct(struct, capacity, device, skip[struct])
+            for struct in (Paths, TriangleHits, Surfaces, ShadowRays)
         )
         self.paths, self.surfaces, self.shadow_rays = paths, surfaces, shadow_rays
+        self.triangle_hits = triangle_hits
         geometry, materials = device_scene.geometry, device_scene.materials
         textures, lights = device_scene.textures, device_scene.lights
         rays, hits, escaped, emissive, shadow = (
@@ -247,12 +259,14 @@ class Worker:
         # In the order of the kernels' parameters.
         arguments = {
             "generate": [camera, tile, window, scale, seed, paths, rays, counters, totals],
-            "intersect": [geometry, paths, rays, max_depth, surfaces, hits, escaped, emissive, counters],
+            "stream": [geometry, paths, rays, triangle_hits],
+            "intersect": [geometry, paths, rays, triangle_hits, max_depth, surfaces, hits, escaped, emissive, counters],
             "perturb": [materials, textures, paths, rays, surfaces],
             "escaped": [lights, paths, escaped, counters],
             "emission": [geometry, lights, textures, paths, surfaces, emissive, counters],
             "aov": [materials, textures, paths, surfaces, tile, stride, sums],
             "direct": [*tables, paths, surfaces, hits, seed, shadow_rays, shadow, counters],
+            "stream_shadow": [geometry, shadow, shadow_rays],
             "shadow": [geometry, shadow_rays, shadow, paths],
             "drain": [counters, totals],
             "scatter": [materials, textures, surfaces, hits, rr_depth, seed, paths, rays, counters],
@@ -309,12 +323,14 @@ class Worker:
         self._launch("accumulate", pixels)
 
     def _bounce(self, aov_pixels: int = 0) -> None:
+        self._launch("stream", min(1, self._threads("rays")))
         self._launch("intersect", "rays")
         self._launch("perturb", "rays")
         self._launch("escaped", "escaped")
         self._launch("emission", "emissive")
         self._launch("aov", aov_pixels)
         self._launch("direct", "hits")
+        self._launch("stream_shadow", min(1, self._threads("shadow")))
         self._launch("shadow", "shadow")
         self._launch("drain", 1)
         self._launch("scatter", "hits")

@@ -6,7 +6,7 @@ the medium follows from the side a ray leaves to, whatever the BSDF did: reflect
 
 import warp as wp
 
-from wavefront.accel.mesh_query import INFINITE
+from wavefront.accel.geometry import INFINITE
 
 
 @wp.func

@@ -24,6 +24,7 @@ import math
 import warp as wp
 
 from wavefront.queues import SAMPLE_COUNT, TILE_WIDTH, TILE_X, TILE_Y
+from wavefront.stage_kernel import stage_kernel
 
 # Fields that a guide may ask for, by type: one value per record.
 FIELDS = {
@@ -219,7 +220,7 @@ def make_gather(fields: tuple[str, ...]):
         """Whether the scattering of this entry makes a record."""
         return rows.pdf[entry] > 0.0 and wp.isfinite(rows.arrival[entry + rows.count])
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def sum_radiance(
         # in and out
         rows: Rows,
@@ -240,7 +241,7 @@ def make_gather(fields: tuple[str, ...]):
         rows.arrival[row] = L
         counts[row] = records
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def gather_records(
         rows: Rows,
         offsets: wp.array[wp.int32],

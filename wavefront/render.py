@@ -19,6 +19,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 
 import wavefront
+from wavefront.accel.intersector import ACCELS
 from wavefront.checkpoint import CheckpointError, CheckpointWriter
 from wavefront.errors import WavefrontError
 from wavefront.film import CHANNELS
@@ -166,6 +167,9 @@ def build_parser() -> argparse.ArgumentParser:
 
     machine = parser.add_argument_group("machine")
     machine.add_argument("--device", default="cpu", help="cpu (default), cuda or cuda:N")
+    machine.add_argument(
+        "--accel", choices=ACCELS, default="bvh", help="how rays find triangles; mesh: queries of wp.Mesh, a reference"
+    )
     machine.add_argument("--threads", type=int, metavar="N", help="workers on the CPU device; default: all cores")
     machine.add_argument(
         "--memory",
@@ -369,6 +373,7 @@ def make_renderer(arguments: argparse.Namespace, scene: Scene, guide: Guide | No
         profile=arguments.profile,
         on_compile=lambda message: console.print(message, highlight=False),
         guide=guide,
+        accel=arguments.accel,
     )
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import warp as wp
 
 import wavefront
+from wavefront.accel.intersector import ACCELS
 from wavefront.checkpoint import CheckpointError, film_sections, read_checkpoint, write_checkpoint
 from wavefront.errors import WavefrontError
 from wavefront.film import BLOCK_PIXELS, CHANNELS, Film
@@ -119,6 +120,7 @@ class Renderer:
             A scene that names one needs either, because methods are no part of the renderer: `guiding.guide_of(scene)`
             makes it.
         profile: On CUDA, time every stage, at the price of a synchronisation after each.
+        accel: How rays find triangles: ``bvh``, our hierarchy, or ``mesh``, queries of `wp.Mesh`, as a reference.
         on_compile: Called with a message before kernels are compiled.
 
     Attributes:
@@ -145,11 +147,14 @@ class Renderer:
         profile: bool = False,
         on_compile: Callable[[str], None] | None = None,
         guide: Guide | msgspec.UnsetType | None = msgspec.UNSET,
+        accel: str = "bvh",
     ):
         if not 0 <= seed < 2**64:
             raise WavefrontError(f"seed {seed} is out of range; allowed: 0 to 2^64 - 1")
         if threads is not None and threads < 1:
             raise WavefrontError(f"{threads} threads; allowed: 1 or more")
+        if accel not in ACCELS:
+            raise WavefrontError(f"accel {accel!r}; allowed: {', '.join(ACCELS)}")
         scene = checked(scene)  # a scene built in Python gets the checks that a file gets, and a copy is kept
         if guide is msgspec.UNSET:
             if scene.integrator.guide is not None:
@@ -169,7 +174,7 @@ class Renderer:
                 )
         self.warnings = validate(scene)
         self.scene, self.device, self.seed, self.strict = scene, resolve_device(device), seed, strict
-        self.device_scene = upload_scene(scene, self.device)
+        self.device_scene = upload_scene(scene, self.device, accel)
         self.warnings += self.device_scene.notes
         self.features = make_features(scene, self.device_scene, guide)
         self.kernels = make_kernels(self.features)
@@ -327,6 +332,7 @@ class Renderer:
             "wavefront": wavefront.__version__,
             "warp": wp.config.version,
             "device": self.device.split(":")[0],
+            "accel": self.features.accel,
             "seed": self.seed,
             "scene": self.scene_records,
         } | ({"guide": {"name": self.guide.name, "settings": self.guide.identity()}} if self.guide else {})

@@ -5,8 +5,8 @@ import functools
 
 import warp as wp
 
+from wavefront.accel.geometry import Geometry, hit_type
 from wavefront.accel.instance import normal_to_world, offset_to_world, point_to_local, point_to_world
-from wavefront.accel.mesh_query import Geometry, hit_type
 from wavefront.warp_samples import orthonormal_basis
 
 # Roundings in an interpolated position and in a ray-triangle test, in units of float32's 2^-24: a handful each (Higham

@@ -72,14 +72,14 @@ def wrap_coordinate(i: int, size: int, mode: int) -> int:
     """Index of the pixel that coordinate `i` falls on; `i` may be any integer."""
     if mode == WRAP_CLAMP:
         return wp.clamp(i, 0, size - 1)
-    if mode == WRAP_MIRROR:
-        period = 2 * size
+    period = wp.where(mode == WRAP_MIRROR, 2 * size, size)
+    # One period at most is what a coordinate is off as a rule, and a division takes long.
+    m = wp.where(i < 0, i + period, wp.where(i >= period, i - period, i))
+    if m < 0 or m >= period:
         m = i % period
         if m < 0:
             m += period
-        return wp.where(m < size, m, period - 1 - m)
-    m = i % size
-    return wp.where(m < 0, m + size, m)
+    return wp.where(m < size, m, period - 1 - m)
 
 
 @wp.func

@@ -15,7 +15,7 @@ import warp as wp
 from rich.table import Table
 
 from wavefront import queues
-from wavefront.accel.mesh_query import hit_type
+from wavefront.accel.geometry import hit_type
 from wavefront.errors import WavefrontError
 from wavefront.film import Film
 from wavefront.integrator import Tile, Worker
@@ -147,7 +147,10 @@ class TraceWorker(Worker):
         self.light_sample = wp.zeros(1, dtype=LightSample, device=device)
         tables = [scene.geometry, scene.materials, scene.textures, scene.lights]
         self.inspectors = {
-            "intersect": (make_inspect_hit(f.triangles, f.spheres, f.instances), [scene.geometry, self.paths, self.hit])
+            "intersect": (
+                make_inspect_hit(f.triangles, f.spheres, f.instances, f.accel),
+                [scene.geometry, self.paths, self.hit],
+            )
         }
         if f.light_sampling:
             arguments = [*tables, self.paths, self.surfaces, wp.uint64(renderer.seed), self.queues.counters]

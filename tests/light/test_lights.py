@@ -9,7 +9,8 @@ import warp as wp
 from scipy import stats
 
 from tests.chi_square import FALSE_ALARM_RATE, p_value, sidak
-from wavefront.accel.mesh_query import Geometry, make_intersector
+from wavefront.accel.geometry import Geometry
+from wavefront.accel.intersector import make_intersector
 from wavefront.light.sampling import LightSample, make_light_sampler, select_light
 from wavefront.light.tables import Light, LightTables, build_alias_table
 from wavefront.scene import description as d
@@ -21,7 +22,7 @@ DEVICE = "cpu"
 N = 100_000
 ULP = 2.0**-24
 
-closest_hit, occluded = make_intersector(True, True)
+closest_hit, occluded = make_intersector(True, True)[:2]
 vertex_of = make_vertex(True, True, True, False, False, False)
 sample_light, light_pdf = make_light_sampler(("constant", "sphere", "triangle"), ())
 

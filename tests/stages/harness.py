@@ -6,7 +6,8 @@ import numpy as np
 import warp as wp
 
 from wavefront import queues
-from wavefront.accel.mesh_query import Geometry, Shape
+from wavefront.accel.bvh import TriangleBvh
+from wavefront.accel.geometry import Geometry, Shape
 from wavefront.bsdf import tables as bsdf
 from wavefront.light import tables as light
 from wavefront.queues import Paths, Queue, ShadowRays, Surfaces, allocate_struct
@@ -114,8 +115,7 @@ class Scene:
         defaults = [{"first_light": -1, "first_primitive": i} for i in range(total)]
         g.shapes = records(Shape, [a | b for a, b in zip(defaults, shapes or [{}] * total, strict=True)])
         if count:
-            self.mesh = wp.Mesh(g.points, g.indices)
-            g.mesh = self.mesh.id
+            g.bvh = TriangleBvh(g.points, g.indices).bvh
         if len(spheres):
             s = np.asarray(spheres, np.float32)
             self.bvh = wp.Bvh(array(s[:, :3] - 1.001 * s[:, 3:], wp.vec3), array(s[:, :3] + 1.001 * s[:, 3:], wp.vec3))

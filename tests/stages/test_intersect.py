@@ -6,6 +6,7 @@ import warp as wp
 
 from tests.stages.harness import Counters, Scene, array, launch, paths, surfaces, unit
 from wavefront import queues
+from wavefront.queues import TriangleHits
 from wavefront.stages.intersect import make_intersect
 
 FAR = -5.0
@@ -59,7 +60,8 @@ def trace(
     s = surfaces(n, material=99, light=99)
     rays = counters.queue("rays", range(n) if slots is None else slots)
     out = [counters.queue(name, capacity=capacity) for name in ("hits", "escaped", "emissive")]
-    launch(make_intersect(True, True, **features), 16, scene.geometry, p, rays, max_depth, s, *out, counters.array)
+    inputs = [scene.geometry, p, rays, TriangleHits(), max_depth, s, *out, counters.array]
+    launch(make_intersect(True, True, **features), 16, *inputs)
     return s, counters
 
 

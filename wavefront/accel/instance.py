@@ -7,7 +7,8 @@ import warp as wp
 class Group:
     """Shapes in a space of their own."""
 
-    mesh: wp.uint64  # 0: no triangles
+    root: wp.int32  # of its triangles in `Geometry.bvh`; -1: it has none
+    mesh: wp.uint64  # the same for `wp.Mesh` queries
     sphere_bvh: wp.uint64  # 0: no spheres
     first_triangle: wp.int32
     first_sphere: wp.int32

@@ -10,6 +10,7 @@ import warp as wp
 from wavefront.bsdf.fresnel import fresnel_dielectric
 from wavefront.bsdf.microfacet import sample_visible_normal, smith_g1
 from wavefront.bsdf.rough_plastic import TABLE_SIZE
+from wavefront.stage_kernel import stage_kernel
 
 _NODES = 96  # of the quadrature over the unit square of a microfacet normal, in each direction
 
@@ -31,7 +32,7 @@ def diffuse_fresnel(eta: float) -> float:
     return float(np.sum(w * c * 0.5 * (r_s**2 + r_p**2)))
 
 
-@wp.kernel(enable_backward=False, module="unique")
+@stage_kernel
 def _integrate_coating(
     eta: float,
     alpha: wp.vec2,

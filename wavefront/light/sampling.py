@@ -6,7 +6,7 @@ import functools
 
 import warp as wp
 
-from wavefront.accel.mesh_query import INFINITE, Geometry
+from wavefront.accel.geometry import INFINITE, Geometry
 from wavefront.light.delta import spot_falloff
 from wavefront.light.envmap import envmap_storage, make_envmap
 from wavefront.light.sun import sample_sun

@@ -7,7 +7,8 @@ import dataclasses
 import numpy as np
 import warp as wp
 
-from wavefront.accel.mesh_query import Geometry, Shape
+from wavefront.accel.bvh import TriangleBvh, place_triangles
+from wavefront.accel.geometry import Geometry, Shape
 from wavefront.bsdf import tables as bsdf_tables
 from wavefront.errors import SceneError
 from wavefront.film import LUMINANCE
@@ -46,6 +47,8 @@ class DeviceScene:
     media: bool
     maps: tuple[str, ...]
     instances: tuple[str, ...]
+    accel: str
+    streams: bool
     texture_kinds: tuple[str, ...]
     light_kinds: tuple[str, ...]
     light_texture_kinds: tuple[str, ...]
@@ -53,18 +56,23 @@ class DeviceScene:
     notes: list[str]
 
 
-def upload_scene(scene: description.Scene, device: str) -> DeviceScene:
+def upload_scene(scene: description.Scene, device: str, accel: str = "bvh") -> DeviceScene:
     """Loads meshes and images, builds the acceleration structure and the light table, and moves all to `device`.
+
+    Args:
+        scene: Valid records.
+        device: Where to.
+        accel: How rays will find triangles, one of `wavefront.accel.intersector.ACCELS`.
 
     Raises:
         SceneError: A file is missing or unreadable, a mesh is empty, an emitter has no area.
     """
-    return _Upload(scene, device).run()
+    return _Upload(scene, device, accel).run()
 
 
 class _Upload:
-    def __init__(self, scene: description.Scene, device: str):
-        self.scene, self.device = scene, device
+    def __init__(self, scene: description.Scene, device: str, accel: str):
+        self.scene, self.device, self.accel = scene, device, accel
         self.atlas = TextureAtlas()
         self.materials = MaterialUpload(scene, self.atlas)
         self.media = MediumUpload(scene)
@@ -109,9 +117,11 @@ class _Upload:
             maps=tuple(sorted(self.materials.map_kinds)),
             instances=tuple(
                 kind
-                for kind, field in (("spheres", "sphere_bvh"), ("triangles", "mesh"))
+                for kind, field in (("spheres", "sphere_count"), ("triangles", "triangle_count"))
                 if any(getattr(part, field) for part in parts[1:])
             ),
+            accel=self.accel,
+            streams=self.accel == "bvh" and wp.get_device(self.device).is_cpu,
             texture_kinds=tuple(sorted(set(self.atlas.kinds))),
             light_kinds=light_kinds,
             light_texture_kinds=tuple(sorted(self.light_texture_kinds)),
@@ -197,26 +207,33 @@ class _Upload:
             # The box is grown by some roundings, so that its sides never cut the sphere.
             grown = table[:, 3:] + 1e-6 * (np.abs(table[:, :3]).max(axis=1, keepdims=True) + table[:, 3:])
             lowers, uppers = table[:, :3] - grown, table[:, :3] + grown
+        hierarchies: list[tuple[Part, TriangleBvh]] = []
         for part in parts:
             triangles = slice(part.first_triangle, part.first_triangle + part.triangle_count)
             balls = slice(part.first_sphere, part.first_sphere + part.sphere_count)
             if part.triangle_count:
-                # Vertices are those of all; leaves of 2 triangles traced fastest of 1, 2, 4 and 8 on the CPU device.
+                # Vertices are those of all.
                 indices = geometry.indices[3 * triangles.start : 3 * triangles.stop]
-                mesh = wp.Mesh(geometry.points, indices, bvh_constructor="sah", bvh_leaf_size=2)
-                self.keep_alive.append(mesh)
-                part.mesh = mesh.id
+                if self.accel == "bvh":
+                    hierarchies.append((part, TriangleBvh(geometry.points, indices, part.first_triangle)))
+                else:  # leaves of 2 triangles traced fastest of 1, 2, 4 and 8 on the CPU device
+                    mesh = wp.Mesh(geometry.points, indices, bvh_constructor="sah", bvh_leaf_size=2)
+                    self.keep_alive.append(mesh)
+                    part.mesh, part.root = mesh.id, 0
             if part.sphere_count:
                 boxes = (wp.array(corner[balls], dtype=wp.vec3, device=device) for corner in (lowers, uppers))
                 bvh = wp.Bvh(*boxes)
                 self.keep_alive.append(bvh)
                 part.sphere_bvh = bvh.id
                 part.enclose([lowers[balls], uppers[balls]])
-        geometry.mesh, geometry.sphere_bvh = parts[0].mesh, parts[0].sphere_bvh
+        if hierarchies:
+            geometry.bvh = place_triangles([bvh for _, bvh in hierarchies], geometry.points)
+            for part, bvh in hierarchies:
+                part.root = bvh.first_node
+        geometry.root, geometry.mesh, geometry.sphere_bvh = parts[0].root, parts[0].mesh, parts[0].sphere_bvh
         bounds = parts[0].bounds
         if len(parts) > 1:
             instances = self.instances.upload(geometry, parts[1:])
-            self.keep_alive.append(self.instances.bvh)
             bounds = np.array([np.minimum(bounds[0], instances[0]), np.maximum(bounds[1], instances[1])])
         return geometry, bounds if len(counts) else np.zeros((2, 3)), parts
 

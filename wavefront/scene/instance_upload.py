@@ -8,8 +8,9 @@ from collections.abc import Iterable
 import numpy as np
 import warp as wp
 
+from wavefront.accel.bvh import BoxBvh
+from wavefront.accel.geometry import Geometry
 from wavefront.accel.instance import Group, Instance
-from wavefront.accel.mesh_query import Geometry
 from wavefront.scene import description
 from wavefront.scene.texture_upload import struct_array
 from wavefront.scene.transforms import to_matrix
@@ -24,7 +25,8 @@ class Part:
     triangle_count: int
     first_sphere: int
     sphere_count: int
-    mesh: int = 0  # handle of the acceleration structure; 0: no triangles
+    root: int = -1  # of its triangles in the hierarchy of all; -1: it has none
+    mesh: int = 0  # handle of a `wp.Mesh`, if those were chosen
     sphere_bvh: int = 0
     bounds: np.ndarray = dataclasses.field(default_factory=lambda: np.array([np.full(3, np.inf), np.full(3, -np.inf)]))
 
@@ -51,7 +53,6 @@ class InstanceUpload:
         self.group_of = np.array([index[instance.group] for instance in scene.instances], np.int32)
         matrices = [to_matrix(item.to_world, f"instances[{i}].to_world") for i, item in enumerate(scene.instances)]
         self.matrices = np.array(matrices).reshape(-1, 4, 4)
-        self.bvh: wp.Bvh | None = None
 
     def upload(self, geometry: Geometry, parts: list[Part]) -> np.ndarray:
         """Fills in the instances of `geometry` and returns their bounds, lower and upper corner.
@@ -66,7 +67,7 @@ class InstanceUpload:
         host["to_local"] = np.linalg.inv(host["to_world"].astype(np.float64))
         host["group"] = self.group_of
         geometry.instances = wp.array(host, dtype=Instance, device=self.device)
-        names = ("mesh", "sphere_bvh", "first_triangle", "first_sphere")
+        names = ("root", "mesh", "sphere_bvh", "first_triangle", "first_sphere")
         records = [{name: getattr(part, name) for name in names} for part in parts]
         geometry.groups = struct_array(Group, records, self.device)
 
@@ -80,6 +81,5 @@ class InstanceUpload:
         )
         lower, upper = ((center + sign * half).astype(np.float32) for sign in (-1.0, 1.0))
         boxes = (wp.array(corner, dtype=wp.vec3, device=self.device) for corner in (lower, upper))
-        self.bvh = wp.Bvh(*boxes)
-        geometry.instance_bvh = self.bvh.id
+        geometry.instance_bvh = BoxBvh(*boxes).bvh
         return np.array([lower.min(axis=0), upper.max(axis=0)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from wavefront.accel.mesh_query import Geometry
+from wavefront.accel.geometry import Geometry
 from wavefront.scene import description
 from wavefront.scene.lookup import resolve_medium
 from wavefront.scene.texture_upload import rgb

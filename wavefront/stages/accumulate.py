@@ -8,6 +8,7 @@ import warp as wp
 
 from wavefront.film import FilmArrays, luminance
 from wavefront.queues import NONFINITE_ACCUMULATE, SAMPLE_COUNT, TILE_HEIGHT, TILE_WIDTH, TILE_X, TILE_Y, Paths
+from wavefront.stage_kernel import stage_kernel
 
 
 @functools.cache
@@ -19,7 +20,7 @@ def make_accumulate(variance: bool, weighted: bool = False):
         weighted: Samples have the weight `FilmArrays.weights[0]`.
     """
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def accumulate_samples(
         paths: Paths,
         tile: wp.array[wp.int32],

@@ -19,9 +19,10 @@ from wavefront.queues import (
     TOTAL_RAYS,
     TOTAL_SHADOW_RAYS,
 )
+from wavefront.stage_kernel import stage_kernel
 
 
-@wp.kernel(enable_backward=False, module="unique")
+@stage_kernel
 def drain_rays(counters: wp.array[wp.int32], totals: wp.array[wp.int64]):
     """Before scattering: counts the rays traced and empties their queue, which scattering fills again."""
     totals[TOTAL_RAYS] += wp.int64(counters[RAYS])
@@ -29,7 +30,7 @@ def drain_rays(counters: wp.array[wp.int32], totals: wp.array[wp.int64]):
     counters[RAYS] = 0
 
 
-@wp.kernel(enable_backward=False, module="unique")
+@stage_kernel
 def advance_bounce(counters: wp.array[wp.int32]):
     """After scattering: empties the other queues and tells whether there is another bounce."""
     counters[HITS] = 0
@@ -40,7 +41,7 @@ def advance_bounce(counters: wp.array[wp.int32]):
     counters[CONTINUE] = wp.where(counters[RAYS] > 0, 1, 0)
 
 
-@wp.kernel(enable_backward=False, module="unique")
+@stage_kernel
 def advance_guided_bounce(counters: wp.array[wp.int32]):
     """As `advance_bounce`, with the queues of a guided bounce."""
     counters[HITS] = 0

@@ -10,6 +10,7 @@ from wavefront.bsdf.dispatch import make_bsdf
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.film import FilmArrays
 from wavefront.queues import FIRST_SAMPLE, SAMPLE_COUNT, TILE_HEIGHT, TILE_WIDTH, TILE_X, TILE_Y, Paths, Surfaces
+from wavefront.stage_kernel import stage_kernel
 from wavefront.texture import TextureTables
 
 
@@ -30,7 +31,7 @@ def make_aov(arrays: tuple[str, ...], bsdfs: tuple[str, ...], mask: bool, textur
     """
     _, _, eval_albedo = make_bsdf(bsdfs, mask, textures, False, False)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def accumulate_aovs(
         materials: MaterialTables,
         textures: TextureTables,

@@ -6,12 +6,13 @@ import functools
 
 import warp as wp
 
-from wavefront.accel.mesh_query import Geometry
+from wavefront.accel.geometry import Geometry
 from wavefront.bsdf.dispatch import is_smooth
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.light.mis import power_heuristic
 from wavefront.light.tables import DELTA, LightTables
 from wavefront.queues import DEPTH, NONFINITE_DIRECT, Paths, Queue, ShadowRays, Surfaces, push, queue_size
+from wavefront.stage_kernel import stage_kernel
 from wavefront.stages.light_proposal import make_light_proposal
 from wavefront.texture import TextureTables
 
@@ -35,7 +36,7 @@ def make_direct(
     )
     extended = any(kind not in DELTA for kind in lights)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def sample_direct_light(
         geometry: Geometry,
         materials: MaterialTables,

@@ -6,11 +6,12 @@ import functools
 
 import warp as wp
 
-from wavefront.accel.mesh_query import Geometry
+from wavefront.accel.geometry import Geometry
 from wavefront.light.mis import power_heuristic
 from wavefront.light.sampling import make_light_sampler
 from wavefront.light.tables import AREA, LightTables
 from wavefront.queues import NONFINITE_EMISSION, Paths, Queue, Surfaces, queue_size
+from wavefront.stage_kernel import stage_kernel
 from wavefront.stages.contribution import add_radiance
 from wavefront.texture import TextureTables, make_eval_parameter
 
@@ -23,7 +24,7 @@ def make_emission(lights: tuple[str, ...], light_textures: tuple[str, ...], ligh
     eval_parameter = make_eval_parameter(light_textures)
     textured = bool(light_textures)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def add_emission(
         geometry: Geometry,
         lights: LightTables,

@@ -11,6 +11,7 @@ from wavefront.light.mis import power_heuristic
 from wavefront.light.sun import in_sun
 from wavefront.light.tables import LightTables
 from wavefront.queues import NONFINITE_ESCAPED, Paths, Queue, queue_size
+from wavefront.stage_kernel import stage_kernel
 from wavefront.stages.contribution import add_radiance
 from wavefront.warp_samples import cone_pdf, sphere_pdf
 
@@ -24,7 +25,7 @@ def make_escaped(escape_lights: tuple[str, ...], light_sampling: bool):
     has_envmap = storage is not None
     eval_envmap, _ = make_envmap(storage, density=light_sampling)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def add_environment(
         lights: LightTables,
         paths: Paths,

@@ -28,6 +28,7 @@ from wavefront.queues import (
 )
 from wavefront.rng import PURPOSE_CAMERA
 from wavefront.sampler import SAMPLERS
+from wavefront.stage_kernel import stage_kernel
 from wavefront.warp_samples import square_to_gaussian, square_to_tent
 
 
@@ -45,7 +46,7 @@ def make_generate(camera_kind: str, filter_kind: str, transmission: bool, sample
     camera_ray = make_camera_ray(camera_kind)
     draw = SAMPLERS[sampler]
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def generate_rays(
         camera: Camera,
         tile: wp.array[wp.int32],

@@ -9,11 +9,12 @@ import functools
 
 import warp as wp
 
-from wavefront.accel.mesh_query import Geometry
+from wavefront.accel.geometry import Geometry
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.light.tables import LightTables
 from wavefront.proposals import LightProposals
 from wavefront.queues import DEPTH, Paths, Queue, ShadowRays, Surfaces, push, queue_size
+from wavefront.stage_kernel import stage_kernel
 from wavefront.stages.light_proposal import make_light_proposal
 from wavefront.texture import TextureTables
 
@@ -36,7 +37,7 @@ def make_guided_direct(
         bsdfs, mask, textures, lights, light_textures, uvs, tangents, maps, media, sampler
     )
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def propose_direct_light(
         geometry: Geometry,
         materials: MaterialTables,

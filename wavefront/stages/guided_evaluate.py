@@ -12,6 +12,7 @@ from wavefront.bsdf.frame import make_frame
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.proposals import Proposals
 from wavefront.queues import NONFINITE_SCATTER, Paths, Queue, Surfaces, queue_size
+from wavefront.stage_kernel import stage_kernel
 from wavefront.texture import TextureTables
 
 UNIT_TOLERANCE = wp.constant(1.0e-3)  # of the squared length of a proposed direction
@@ -32,7 +33,7 @@ def make_guided_evaluate(
     frame_at, _ = make_frame(tangents, bool(maps))
     crossed_eta = make_crossed_eta(bsdfs)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def evaluate_directions(
         materials: MaterialTables,
         textures: TextureTables,

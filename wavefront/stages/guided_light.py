@@ -10,6 +10,7 @@ from wavefront.light.mis import power_heuristic
 from wavefront.proposals import LightProposals, Proposals, make_bsdf_share, make_scatter_pdf
 from wavefront.queues import NONFINITE_DIRECT, Paths, Queue, ShadowRays, push, queue_size
 from wavefront.recording import RecordScratch
+from wavefront.stage_kernel import stage_kernel
 
 
 @functools.cache
@@ -22,7 +23,7 @@ def make_guided_light(mixed_deltas: bool, guide_pdf: bool, recorded: bool):
     """
     bsdf_share, scatter_pdf = make_bsdf_share(mixed_deltas), make_scatter_pdf(guide_pdf)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def weight_light_samples(
         paths: Paths,
         proposals: Proposals,

@@ -14,6 +14,7 @@ from wavefront.proposals import TECHNIQUE_BSDF, TECHNIQUE_GUIDE, Proposals, make
 from wavefront.queues import DEPTH, Paths, Queue, Surfaces, push, queue_size
 from wavefront.rng import PURPOSE_BSDF, PURPOSE_TECHNIQUE
 from wavefront.sampler import SAMPLERS
+from wavefront.stage_kernel import stage_kernel
 from wavefront.texture import TextureTables
 
 
@@ -35,7 +36,7 @@ def make_guided_propose(
     draw = SAMPLERS[sampler]
     bsdf_share = make_bsdf_share(mixed_deltas)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def propose_directions(
         materials: MaterialTables,
         textures: TextureTables,

@@ -13,9 +13,10 @@ import warp as wp
 
 from wavefront.queues import DEPTH, Paths, Queue, queue_size
 from wavefront.recording import RecordScratch, Rows, record_row
+from wavefront.stage_kernel import stage_kernel
 
 
-@wp.kernel(enable_backward=False, module="unique")
+@stage_kernel
 def put_throughput_aside(
     rays: Queue,
     # out
@@ -39,7 +40,7 @@ def make_record_arrivals(taken: bool):
         taken: Whether weights take from the emission, and the records shall have what they take.
     """
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def record_arrivals(
         rays: Queue,
         tile: wp.array[wp.int32],
@@ -78,7 +79,7 @@ def make_record_arrivals(taken: bool):
     return record_arrivals
 
 
-@wp.kernel(enable_backward=False, module="unique")
+@stage_kernel
 def record_direct_light(
     shadow: Queue,
     tile: wp.array[wp.int32],

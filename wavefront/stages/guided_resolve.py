@@ -13,6 +13,7 @@ from wavefront.queues import DEPTH, NONFINITE_SCATTER, Paths, Queue, Surfaces, p
 from wavefront.recording import Rows, record_row
 from wavefront.rng import PURPOSE_BSDF
 from wavefront.sampler import SAMPLERS
+from wavefront.stage_kernel import stage_kernel
 from wavefront.stages.scatter import survival_probability
 from wavefront.surface import spawn_origin
 
@@ -72,7 +73,7 @@ def make_guided_resolve(
         if wp.static("transmits" in records):
             rows.transmits[entry] = proposals.transmits[slot]
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def resolve_directions(
         proposals: Proposals,
         surfaces: Surfaces,

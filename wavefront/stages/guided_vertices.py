@@ -13,6 +13,7 @@ from wavefront.bsdf.roughness import make_roughness
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.proposals import Proposals
 from wavefront.queues import Paths, Queue, Surfaces, push, queue_size
+from wavefront.stage_kernel import stage_kernel
 from wavefront.texture import TextureTables
 
 
@@ -29,7 +30,7 @@ def make_guided_vertices(
     delta_probability = make_delta_probability(bsdfs, mask, textures)
     roughness_at = make_roughness(bsdfs, textures)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def queue_guided_vertices(
         materials: MaterialTables,
         textures: TextureTables,

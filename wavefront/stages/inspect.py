@@ -5,7 +5,8 @@ import functools
 
 import warp as wp
 
-from wavefront.accel.mesh_query import Geometry, hit_type, make_intersector
+from wavefront.accel.geometry import Geometry, hit_type
+from wavefront.accel.intersector import make_intersector
 from wavefront.bsdf.dispatch import is_smooth, make_bsdf
 from wavefront.bsdf.frame import make_frame
 from wavefront.bsdf.tables import MaterialTables
@@ -14,16 +15,17 @@ from wavefront.light.tables import LightTables
 from wavefront.queues import DEPTH, Paths, Surfaces
 from wavefront.rng import PURPOSE_LIGHT
 from wavefront.sampler import SAMPLERS
+from wavefront.stage_kernel import stage_kernel
 from wavefront.texture import TextureTables
 
 
 @functools.cache
-def make_inspect_hit(triangles: bool, spheres: bool, instances: tuple[str, ...]):
+def make_inspect_hit(triangles: bool, spheres: bool, instances: tuple[str, ...], accel: str):
     """Kernel that finds the primitive which the ray in slot 0 meets; the arguments are fields of `Features`."""
-    closest_hit, _ = make_intersector(triangles, spheres, instances)
+    closest_hit = make_intersector(triangles, spheres, instances, accel).closest_hit
     AnyHit = hit_type(instances)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def inspect_hit(
         geometry: Geometry,
         paths: Paths,
@@ -45,7 +47,7 @@ def make_inspect_light(lights: tuple[str, ...], light_textures: tuple[str, ...],
     sample_light, _ = make_light_sampler(lights, light_textures)
     draw = SAMPLERS[sampler]
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def inspect_light(
         geometry: Geometry,
         materials: MaterialTables,
@@ -78,7 +80,7 @@ def make_inspect_bsdf(
     eval_bsdf, _, _ = make_bsdf(bsdfs, mask, textures, tangents, bool(maps))
     frame_at, _ = make_frame(tangents, bool(maps))
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def inspect_bsdf(
         materials: MaterialTables,
         textures: TextureTables,

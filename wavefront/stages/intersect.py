@@ -6,9 +6,11 @@ import functools
 
 import warp as wp
 
-from wavefront.accel.mesh_query import INFINITE, Geometry, make_intersector
+from wavefront.accel.geometry import INFINITE, Geometry, hit_type
+from wavefront.accel.intersector import make_intersector
 from wavefront.medium import transmittance
-from wavefront.queues import DEPTH, Paths, Queue, Surfaces, push, queue_size
+from wavefront.queues import DEPTH, Paths, Queue, Surfaces, TriangleHits, push, queue_size
+from wavefront.stage_kernel import stage_kernel
 from wavefront.surface import make_vertex
 
 
@@ -25,19 +27,24 @@ def make_intersect(
     shape_index: bool = False,
     media: bool = False,
     instances: tuple[str, ...] = (),
+    accel: str = "bvh",
+    streams: bool = False,
 ):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name (or whether there are any).
 
     `shape_index`: whether the index of the shape is an AOV.
     """
-    closest_hit, _ = make_intersector(triangles, spheres, instances)
+    intersector = make_intersector(triangles, spheres, instances, accel)
+    closest_hit, closest_other, AnyHit = intersector.closest_hit, intersector.closest_other, hit_type(instances)
+    traced = triangles and streams
     vertex_of = make_vertex(triangles, spheres, smooth, uvs, tangents, bumps, instances)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def closest_hits(
         geometry: Geometry,
         paths: Paths,  # also out, where a medium absorbs
         rays: Queue,
+        triangle_hits: TriangleHits,
         max_depth: int,
         # out
         surfaces: Surfaces,
@@ -52,7 +59,15 @@ def make_intersect(
         slot = rays.slots[i]
         origin = paths.origin[slot]
         direction = paths.direction[slot]
-        hit = closest_hit(geometry, origin, direction)
+        hit = AnyHit()
+        if wp.static(traced):
+            hit.t = triangle_hits.t[slot]
+            hit.primitive = triangle_hits.primitive[slot]
+            hit.u = triangle_hits.uv[slot][0]
+            hit.v = triangle_hits.uv[slot][1]
+            hit = closest_other(geometry, origin, direction, hit)
+        else:
+            hit = closest_hit(geometry, origin, direction)
         if wp.static(media):
             medium = geometry.camera_medium
             start = origin

@@ -6,7 +6,7 @@ import functools
 
 import warp as wp
 
-from wavefront.accel.mesh_query import INFINITE, Geometry
+from wavefront.accel.geometry import INFINITE, Geometry
 from wavefront.bsdf.dispatch import make_bsdf
 from wavefront.bsdf.frame import make_frame
 from wavefront.bsdf.record import BsdfEval

@@ -9,6 +9,7 @@ import warp as wp
 from wavefront.bsdf.maps import make_mapped_frame
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.queues import Paths, Queue, Surfaces, queue_size
+from wavefront.stage_kernel import stage_kernel
 from wavefront.surface import Vertex
 from wavefront.texture import TextureTables
 
@@ -23,7 +24,7 @@ def make_perturb(textures: tuple[str, ...], uvs: bool, bumps: bool):
     """
     mapped_frame = make_mapped_frame(textures, bumps)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def perturb_frames(
         materials: MaterialTables,
         textures: TextureTables,

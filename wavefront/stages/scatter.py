@@ -13,6 +13,7 @@ from wavefront.medium import medium_towards
 from wavefront.queues import DEPTH, NONFINITE_SCATTER, Paths, Queue, Surfaces, push, queue_size
 from wavefront.rng import PURPOSE_BSDF
 from wavefront.sampler import SAMPLERS
+from wavefront.stage_kernel import stage_kernel
 from wavefront.surface import spawn_origin
 from wavefront.texture import TextureTables
 
@@ -42,7 +43,7 @@ def make_scatter(
     frame_at, _ = make_frame(tangents, bool(maps))
     draw = SAMPLERS[sampler]
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def scatter_paths(
         materials: MaterialTables,
         textures: TextureTables,

@@ -6,16 +6,26 @@ import functools
 
 import warp as wp
 
-from wavefront.accel.mesh_query import Geometry, make_intersector
+from wavefront.accel.geometry import Geometry
+from wavefront.accel.intersector import make_intersector
 from wavefront.queues import Paths, Queue, ShadowRays, queue_size
+from wavefront.stage_kernel import stage_kernel
 
 
 @functools.cache
-def make_shadow(triangles: bool, spheres: bool, instances: tuple[str, ...] = ()):
+def make_shadow(
+    triangles: bool,
+    spheres: bool,
+    instances: tuple[str, ...] = (),
+    accel: str = "bvh",
+    streams: bool = False,
+):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
-    _, occluded = make_intersector(triangles, spheres, instances)
+    intersector = make_intersector(triangles, spheres, instances, accel)
+    occluded, occluded_by_other = intersector.occluded, intersector.occluded_by_other
+    traced = triangles and streams
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @stage_kernel
     def trace_shadow_rays(
         geometry: Geometry,
         shadow_rays: ShadowRays,
@@ -27,7 +37,16 @@ def make_shadow(triangles: bool, spheres: bool, instances: tuple[str, ...] = ())
         if i >= queue_size(shadow):
             return
         slot = shadow.slots[i]
-        if not occluded(geometry, shadow_rays.origin[slot], shadow_rays.direction[slot], shadow_rays.t_max[slot]):
+        blocked = bool(False)
+        if wp.static(traced):
+            blocked = shadow_rays.blocked[slot] == 1
+            if not blocked:
+                blocked = occluded_by_other(
+                    geometry, shadow_rays.origin[slot], shadow_rays.direction[slot], shadow_rays.t_max[slot]
+                )
+        else:
+            blocked = occluded(geometry, shadow_rays.origin[slot], shadow_rays.direction[slot], shadow_rays.t_max[slot])
+        if not blocked:
             paths.L[slot] += shadow_rays.L[slot]
 
     return trace_shadow_rays

@@ -1,0 +1,331 @@
+"""Hierarchies with eight children a node, over triangles and over boxes, as the traversal reads them.
+
+A node is 16 vectors of four: for the lower x of its children two, for y and z as many, then for the upper corners, then
+two with the links (see `wavefront.accel.collapse.link`). A leaf is one or two blocks of four triangles: the x of their
+first vertices, then y and z, then those of the second and third vertices, then the indices of the triangles; places
+without a triangle hold NaN. So that eight boxes or four triangles are tested at once, each with one vector instruction
+a coordinate. Corners are exact, not quantised.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import time
+
+import numpy as np
+import warp as wp
+
+from wavefront.accel import collapse, ploc
+from wavefront.accel.collapse import BLOCK_COST, EMPTY, NODE_COST, WIDTH, Children, WideTree
+
+BLOCK = 4  # triangles of a block
+MAX_BLOCKS = 2  # of a leaf
+NODE_VECTORS = 16
+BLOCK_VECTORS = 10
+MAX_LEVELS = 22  # of a hierarchy
+STACK_SIZE = 160  # entries a traversal needs: a level leaves seven nodes for later, and the last eight
+
+wp.set_module_options({"enable_backward": False})
+
+Extents = wp.types.vector(length=WIDTH, dtype=wp.float32)
+
+
+@wp.struct
+class Bvh:
+    """The tables of one or several hierarchies; each is named by its root."""
+
+    nodes: wp.array[wp.vec4]
+    links: wp.array[wp.vec4i]  # the same memory
+    blocks: wp.array[wp.vec4]
+    primitives: wp.array[wp.vec4i]  # the same memory; of a hierarchy of boxes: one vector a box, its index four times
+
+
+@wp.kernel
+def triangle_bounds(
+    points: wp.array[wp.vec3],
+    indices: wp.array[wp.int32],
+    # out
+    lower: wp.array[wp.vec3],
+    upper: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    a = points[indices[3 * i]]
+    b = points[indices[3 * i + 1]]
+    c = points[indices[3 * i + 2]]
+    lower[i] = wp.min(wp.min(a, b), c)
+    upper[i] = wp.max(wp.max(a, b), c)
+
+
+@wp.kernel
+def write_blocks(
+    points: wp.array[wp.vec3],
+    indices: wp.array[wp.int32],
+    order: wp.array[wp.int32],
+    block_ranges: wp.array[wp.vec2i],
+    first_triangle: int,
+    first_block: int,
+    # out
+    bvh: Bvh,
+    lower: wp.array[wp.vec3],
+    upper: wp.array[wp.vec3],
+):
+    """Vertices and numbers of the triangles of each block, and its box."""
+    i = wp.tid()
+    block = BLOCK_VECTORS * (first_block + i)
+    box_lower = wp.vec3(wp.inf)
+    box_upper = wp.vec3(-wp.inf)
+    numbers = wp.vec4i(-1)
+    for k in range(BLOCK):
+        vertex = wp.vec3(wp.nan)
+        inside = k < block_ranges[i][1]
+        triangle = int(0)
+        if inside:
+            triangle = order[block_ranges[i][0] + k]
+            numbers[k] = first_triangle + triangle
+        for j in range(3):
+            if inside:
+                vertex = points[indices[3 * triangle + j]]
+                box_lower = wp.min(box_lower, vertex)
+                box_upper = wp.max(box_upper, vertex)
+            for axis in range(3):
+                bvh.blocks[block + 3 * j + axis][k] = vertex[axis]
+    bvh.primitives[block + 9] = numbers
+    lower[i] = box_lower
+    upper[i] = box_upper
+
+
+@wp.kernel
+def write_boxes(
+    box_lower: wp.array[wp.vec3],
+    box_upper: wp.array[wp.vec3],
+    order: wp.array[wp.int32],
+    block_ranges: wp.array[wp.vec2i],
+    # out
+    bvh: Bvh,
+    lower: wp.array[wp.vec3],
+    upper: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    index = order[block_ranges[i][0]]
+    bvh.primitives[i] = wp.vec4i(index)
+    lower[i] = box_lower[index]
+    upper[i] = box_upper[index]
+
+
+@wp.kernel
+def write_links(links: wp.array[Children], node_offset: int, block_offset: int, bvh: Bvh):
+    """Links among the tables of several hierarchies; `block_offset` is in units of the links of leaves."""
+    i = wp.tid()
+    for k in range(WIDTH):
+        link = links[i][k]
+        if link >= 0:
+            link += node_offset
+        elif link != EMPTY:
+            link -= block_offset
+        bvh.links[NODE_VECTORS * (node_offset + i) + 12 + k // 4][k % 4] = link
+
+
+@wp.kernel
+def fit_nodes(
+    bvh: Bvh,
+    lower: wp.array[wp.vec3],
+    upper: wp.array[wp.vec3],
+    max_blocks: int,
+    first_block: int,
+    first_node: int,
+):
+    """Boxes of the children of the nodes of one level, from those of blocks and of the level below."""
+    node = NODE_VECTORS * (first_node + wp.tid())
+    for k in range(WIDTH):
+        link = bvh.links[node + 12 + k // 4][k % 4]
+        low = wp.vec3(wp.inf)
+        high = wp.vec3(-wp.inf)
+        if link >= 0:
+            for axis in range(3):
+                side = NODE_VECTORS * link + 2 * axis
+                low[axis] = wp.min(wp.min(bvh.nodes[side]), wp.min(bvh.nodes[side + 1]))
+                high[axis] = wp.max(wp.max(bvh.nodes[side + 6]), wp.max(bvh.nodes[side + 7]))
+        elif link != EMPTY:
+            first = ~link // max_blocks - first_block
+            for b in range(first, first + ~link % max_blocks + 1):
+                low = wp.min(low, lower[b])
+                high = wp.max(high, upper[b])
+        for axis in range(3):
+            bvh.nodes[node + 2 * axis + k // 4][k % 4] = low[axis]
+            bvh.nodes[node + 6 + 2 * axis + k // 4][k % 4] = high[axis]
+
+
+@dataclasses.dataclass(frozen=True)
+class Statistics:
+    """Of a hierarchy.
+
+    Attributes:
+        primitives, nodes, leaves: How many.
+        levels: Of nodes.
+        sah_cost: Expected nodes and blocks of leaves that a random line which meets the root's box visits, weighted by
+            `NODE_COST` and `BLOCK_COST`.
+        node_visits, block_visits: The same apart and without weights.
+        bytes: Of device memory that stays: tables, and what refitting reads.
+        seconds: To build it.
+    """
+
+    primitives: int
+    nodes: int
+    leaves: int
+    levels: int
+    sah_cost: float
+    node_visits: float
+    block_visits: float
+    bytes: int
+    seconds: float
+
+
+def _topology(lower: wp.array, upper: wp.array, block: int, max_blocks: int) -> WideTree:
+    wide = collapse.collapse(ploc.build_binary(lower, upper), block, max_blocks)
+    if len(wide.levels) - 1 > MAX_LEVELS:  # boxes within boxes: pairs along the Morton curve are as good, and shallow
+        wide = collapse.collapse(ploc.build_binary(lower, upper, radius=0), block, max_blocks)
+    return wide
+
+
+class _Hierarchy:
+    """What hierarchies over triangles and over boxes have in common."""
+
+    def __init__(self, wide: WideTree, max_blocks: int, device):
+        self.wide, self.max_blocks, self.device = wide, max_blocks, device
+        self.first_node = self.first_block = 0
+        self.bvh: Bvh | None = None
+        self.build_seconds = 0.0
+
+    @property
+    def node_count(self) -> int:
+        return self.wide.levels[-1]
+
+    @property
+    def block_count(self) -> int:
+        return self.wide.block_ranges.shape[0]
+
+    def _place(self, bvh: Bvh, first_node: int, first_block: int) -> None:
+        """Takes its place in tables that other hierarchies may share."""
+        self.bvh, self.first_node, self.first_block = bvh, first_node, first_block
+        inputs = [self.wide.links, first_node, first_block * self.max_blocks, bvh]
+        wp.launch(write_links, self.node_count, inputs=inputs, device=self.device)
+
+    def _fit(self, write, inputs: list) -> None:
+        lower, upper = (wp.empty(self.block_count, dtype=wp.vec3, device=self.device) for _ in range(2))
+        wp.launch(write, self.block_count, inputs=inputs, outputs=[self.bvh, lower, upper], device=self.device)
+        levels = self.wide.levels
+        for first, end in reversed(list(itertools.pairwise(levels))):
+            inputs = [self.bvh, lower, upper, self.max_blocks, self.first_block, self.first_node + first]
+            wp.launch(fit_nodes, end - first, inputs=inputs, device=self.device)
+
+    def statistics(self) -> Statistics:
+        """Reads the tables back; takes time."""
+        nodes = self.bvh.nodes.numpy().reshape(-1, 8 * WIDTH)[self.first_node : self.first_node + self.node_count]
+        lower, upper = (
+            nodes[:, : 3 * WIDTH].reshape(-1, 3, WIDTH),
+            nodes[:, 3 * WIDTH : 6 * WIDTH].reshape(-1, 3, WIDTH),
+        )
+        links = nodes[:, 6 * WIDTH : 7 * WIDTH].view(np.int32)
+        used = links != EMPTY
+        d = np.where(used[:, None], upper.astype(np.float64) - lower, 0.0)
+        areas = d[:, 0] * d[:, 1] + d[:, 1] * d[:, 2] + d[:, 2] * d[:, 0]
+        d = upper[0].max(axis=1).astype(np.float64) - lower[0].min(axis=1)
+        root = d[0] * d[1] + d[1] * d[2] + d[2] * d[0]
+        leaves = used & (links < 0)
+        blocks = np.where(leaves, ~links % self.max_blocks + 1, 0)
+        node_visits = 1.0 + float(areas[used & ~leaves].sum() / root) if root > 0.0 else 0.0
+        block_visits = float((areas * blocks).sum() / root) if root > 0.0 else 0.0
+        vectors = self.node_count * NODE_VECTORS + self.block_count * self._block_vectors
+        return Statistics(
+            primitives=self.wide.order.shape[0],
+            nodes=self.node_count,
+            leaves=int(leaves.sum()),
+            levels=len(self.wide.levels) - 1,
+            sah_cost=NODE_COST * node_visits + BLOCK_COST * block_visits,
+            node_visits=node_visits,
+            block_visits=block_visits,
+            bytes=16 * vectors + sum(a.capacity for a in (self.wide.links, self.wide.block_ranges, self.wide.order)),
+            seconds=self.build_seconds,
+        )
+
+
+class TriangleBvh(_Hierarchy):
+    """A hierarchy over triangles.
+
+    Args:
+        points: Vertices, [N] vec3, metres.
+        indices: Three a triangle, [3 M] int32, M >= 1.
+        first_triangle: Number of the first triangle in hits.
+    """
+
+    _block_vectors = BLOCK_VECTORS
+
+    def __init__(self, points: wp.array, indices: wp.array, first_triangle: int = 0):
+        begin = time.perf_counter()
+        count, device = indices.shape[0] // 3, points.device
+        lower, upper = (wp.empty(count, dtype=wp.vec3, device=device) for _ in range(2))
+        wp.launch(triangle_bounds, count, inputs=[points, indices], outputs=[lower, upper], device=device)
+        super().__init__(_topology(lower, upper, BLOCK, MAX_BLOCKS), MAX_BLOCKS, device)
+        self.indices, self.first_triangle = indices, first_triangle
+        place_triangles([self], points)
+        wp.synchronize_device(device)
+        self.build_seconds = time.perf_counter() - begin
+
+    def refit(self, points: wp.array) -> None:
+        """Moves the vertices and fits the boxes to them; which triangles are together stays.
+
+        Args:
+            points: As many as before, in the same order.
+        """
+        inputs = [points, self.indices, self.wide.order, self.wide.block_ranges, self.first_triangle, self.first_block]
+        self._fit(write_blocks, inputs)
+
+
+def _tables(nodes: int, block_vectors: int, device) -> Bvh:
+    bvh = Bvh()
+    bvh.nodes = wp.empty(NODE_VECTORS * nodes, dtype=wp.vec4, device=device)
+    bvh.blocks = wp.empty(block_vectors, dtype=wp.vec4, device=device)
+    bvh.links, bvh.primitives = bvh.nodes.view(wp.vec4i), bvh.blocks.view(wp.vec4i)
+    return bvh
+
+
+def place_triangles(hierarchies: list[TriangleBvh], points: wp.array) -> Bvh:
+    """Puts hierarchies over triangles of the same vertices into common tables, which they share from then on.
+
+    The root of each is its `first_node`.
+    """
+    if len(hierarchies) == 1 and hierarchies[0].bvh is not None:
+        return hierarchies[0].bvh
+    nodes, blocks = (sum(getattr(h, name) for h in hierarchies) for name in ("node_count", "block_count"))
+    bvh = _tables(nodes, BLOCK_VECTORS * blocks, points.device)
+    first_node = first_block = 0
+    for hierarchy in hierarchies:
+        hierarchy._place(bvh, first_node, first_block)
+        hierarchy.refit(points)
+        first_node += hierarchy.node_count
+        first_block += hierarchy.block_count
+    return bvh
+
+
+class BoxBvh(_Hierarchy):
+    """A hierarchy over boxes, such as those of instances, with one box a leaf.
+
+    Args:
+        lower, upper: Corners, [N] vec3, N >= 1.
+    """
+
+    _block_vectors = 1
+
+    def __init__(self, lower: wp.array, upper: wp.array):
+        begin = time.perf_counter()
+        device = lower.device
+        super().__init__(_topology(lower, upper, 1, 1), 1, device)
+        self._place(_tables(self.node_count, self.block_count, device), 0, 0)
+        self.refit(lower, upper)
+        wp.synchronize_device(device)
+        self.build_seconds = time.perf_counter() - begin
+
+    def refit(self, lower: wp.array, upper: wp.array) -> None:
+        """Moves the boxes; which are together stays."""
+        self._fit(write_boxes, [lower, upper, self.wide.order, self.wide.block_ranges])

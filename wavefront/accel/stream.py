@@ -1,0 +1,263 @@
+"""Rays against hierarchies on the CPU device: many rays in flight, eight boxes or four triangles an instruction.
+
+A processor waits for memory most of the time that it follows one ray through a hierarchy that does not fit its caches,
+and much of the rest for branches that it guessed wrong. So a thread takes turns with `IN_FLIGHT` rays of a queue: each
+goes one node further and asks for the next one, which arrives while the others have their turns. And a node is tested
+without a branch on its outcome: a sorting network puts the distances of its children in order, and all eight places go
+onto the stack, of which the stack counts those that were met. The arithmetic is that of `wavefront.accel.traverse`.
+
+The C++ uses the vector types of Clang, which compiles kernels for the CPU device, and no instructions by name.
+"""
+
+import warp as wp
+
+from wavefront.accel.bvh import BLOCK_VECTORS, MAX_BLOCKS, NODE_VECTORS, STACK_SIZE, Bvh
+from wavefront.accel.traverse import FAR_SLACK, NEAR_SLACK, STEEPEST
+
+IN_FLIGHT = 16  # rays; 4 gain half of what 16 do on a million triangles, and more little (README, bench_accel)
+
+# Pairs of places that a layer of the sorting network exchanges (Knuth 1998, section 5.3.4: 19 comparators, 6 layers).
+NETWORK = (
+    ((0, 2), (1, 3), (4, 6), (5, 7)),
+    ((0, 4), (1, 5), (2, 6), (3, 7)),
+    ((0, 1), (2, 3), (4, 5), (6, 7)),
+    ((2, 4), (3, 5)),
+    ((1, 4), (3, 6)),
+    ((1, 2), (3, 4), (5, 6)),
+)
+
+
+def _layer(pairs) -> str:
+    """C++ that orders pairs of the vector `key`, the greater first."""
+    partner, source = list(range(8)), list(range(8))
+    for first, second in pairs:
+        partner[first], partner[second] = second, first
+        source[second] += 8  # from the vector of the lesser
+    join = ", ".join
+    return f"""{{
+                    const int8 other = __builtin_shufflevector(key, key, {join(map(str, partner))});
+                    const int8 greater = key > other ? key : other, lesser = key > other ? other : key;
+                    key = __builtin_shufflevector(greater, lesser, {join(map(str, source))});
+                }}"""
+
+
+_STREAM = """
+    #pragma clang fp contract(off)
+    typedef float float8 __attribute__((ext_vector_type(8), aligned(16)));
+    typedef float float4 __attribute__((ext_vector_type(4), aligned(16)));
+    typedef int int8 __attribute__((ext_vector_type(8), aligned(4)));
+    typedef int int4 __attribute__((ext_vector_type(4), aligned(16)));
+    typedef bool bool8 __attribute__((ext_vector_type(8)));
+    constexpr int node_size = 4 * NODE_VECTORS, block_size = 4 * BLOCK_VECTORS;  // floats
+    const float* const nodes = (const float*)bvh.nodes.data;
+    const float* const blocks = (const float*)bvh.blocks.data;
+    struct Ray {
+        float o[3], near_slope[3], far_slope[3];
+        int near_side[3], far_side[3];  // floats from the beginning of a node
+        int kx, ky, kz;
+        float shear_x, shear_y, shear_z;
+        float t, u, v;
+        int primitive, index, link, size;
+        // Of a place on the stack: distance with its last three bits exchanged for the number of the child, and node.
+        int keys[STACK_SIZE + 8], nodes[STACK_SIZE + 8];
+    };
+    Ray rays[IN_FLIGHT];
+    int next = 0, active = 0;
+    // Takes the next ray of the queue.
+    auto begin = [&](Ray& r) -> bool {
+        if (next >= count) return false;
+        const int i = next++;
+        SOURCE
+        for (int k = 0; k < 3; ++k) {
+            r.o[k] = o[k];
+            const bool along = __builtin_fabsf(d[k]) < 1.0f / STEEPEST;
+            const float slope = along ? __builtin_copysignf(STEEPEST, d[k]) : 1.0f / d[k];
+            r.near_slope[k] = slope * NEAR_SLACK;
+            r.far_slope[k] = slope * FAR_SLACK;
+            r.near_side[k] = 8 * k + (slope < 0.0f ? 24 : 0);
+            r.far_side[k] = 8 * k + (slope < 0.0f ? 0 : 24);
+        }
+        r.kz = 0;
+        if (__builtin_fabsf(d[1]) > __builtin_fabsf(d[r.kz])) r.kz = 1;
+        if (__builtin_fabsf(d[2]) > __builtin_fabsf(d[r.kz])) r.kz = 2;
+        r.kx = (r.kz + 1) % 3;
+        r.ky = (r.kx + 1) % 3;
+        if (d[r.kz] < 0.0f) { const int k = r.kx; r.kx = r.ky; r.ky = k; }
+        r.shear_x = d[r.kx] / d[r.kz];
+        r.shear_y = d[r.ky] / d[r.kz];
+        r.shear_z = 1.0f / d[r.kz];
+        r.t = limit;
+        r.u = r.v = 0.0f;
+        r.primitive = -1;
+        r.index = i;
+        r.size = 0;
+        r.link = root;
+        return true;
+    };
+    // Of a triangle with a corner at the origin: ax by - ay bx, see `difference_of_products`.
+    auto twice_area = [](float4 ax, float4 ay, float4 bx, float4 by) -> float4 {
+        const float4 product = ay * bx;
+        return __builtin_elementwise_fma(ax, by, -product) + __builtin_elementwise_fma(-ay, bx, product);
+    };
+    while (active < IN_FLIGHT && begin(rays[active])) ++active;
+    while (active > 0) {
+        for (int a = 0; a < active; ++a) {
+            Ray& r = rays[a];
+            if (r.link >= 0) {
+                const float* const node = nodes + (size_t)r.link * node_size;
+                const float8 nx = (*(const float8*)(node + r.near_side[0]) - r.o[0]) * r.near_slope[0];
+                const float8 ny = (*(const float8*)(node + r.near_side[1]) - r.o[1]) * r.near_slope[1];
+                const float8 nz = (*(const float8*)(node + r.near_side[2]) - r.o[2]) * r.near_slope[2];
+                const float8 fx = (*(const float8*)(node + r.far_side[0]) - r.o[0]) * r.far_slope[0];
+                const float8 fy = (*(const float8*)(node + r.far_side[1]) - r.o[1]) * r.far_slope[1];
+                const float8 fz = (*(const float8*)(node + r.far_side[2]) - r.o[2]) * r.far_slope[2];
+                float8 near = nx > ny ? nx : ny, far = fx < fy ? fx : fy;
+                near = near > nz ? near : nz;
+                far = far < fz ? far : fz;
+                near = near > 0.0f ? near : (float8)(0.0f);
+                far = far < r.t ? far : (float8)(r.t);
+                const auto met = near <= far;
+                // Distances are not negative, and so their bits are in the order of their values.
+                int8 key = (__builtin_bit_cast(int8, near) & ~7) | (int8){0, 1, 2, 3, 4, 5, 6, 7};
+                key = met ? key : (int8)(-1);
+                SORT
+                *(int8*)(r.keys + r.size) = key;
+                *(int8*)(r.nodes + r.size) = (int8)(r.link);
+                r.size += __builtin_popcount(__builtin_bit_cast(unsigned char, __builtin_convertvector(met, bool8)));
+            } else {
+                const int kx = 4 * r.kx, ky = 4 * r.ky, kz = 4 * r.kz;
+                const float ox = r.o[r.kx], oy = r.o[r.ky], oz = r.o[r.kz];
+                const float* block = blocks + (size_t)(~r.link / MAX_BLOCKS) * block_size;
+                for (int n = ~r.link % MAX_BLOCKS; n >= 0; --n, block += block_size) {
+                    const float4 az = *(const float4*)(block + kz) - oz;
+                    const float4 bz = *(const float4*)(block + 12 + kz) - oz;
+                    const float4 cz = *(const float4*)(block + 24 + kz) - oz;
+                    const float4 ax = (*(const float4*)(block + kx) - ox) - r.shear_x * az;
+                    const float4 ay = (*(const float4*)(block + ky) - oy) - r.shear_y * az;
+                    const float4 bx = (*(const float4*)(block + 12 + kx) - ox) - r.shear_x * bz;
+                    const float4 by = (*(const float4*)(block + 12 + ky) - oy) - r.shear_y * bz;
+                    const float4 cx = (*(const float4*)(block + 24 + kx) - ox) - r.shear_x * cz;
+                    const float4 cy = (*(const float4*)(block + 24 + ky) - oy) - r.shear_y * cz;
+                    const float4 u = twice_area(cx, cy, bx, by);
+                    const float4 v = twice_area(ax, ay, cx, cy);
+                    const float4 w = twice_area(bx, by, ax, ay);
+                    const int4 front = (u >= 0.0f) & (v >= 0.0f) & (w >= 0.0f);
+                    const int4 back = (u <= 0.0f) & (v <= 0.0f) & (w <= 0.0f);
+                    if (!__builtin_reduce_or(front | back)) continue;
+                    const float4 det = u + v + w;
+                    const float4 weight_a = u / det, weight_b = v / det;
+                    const float4 t = r.shear_z * (weight_a * az + weight_b * bz + (w / det) * cz);
+                    const int4 met = (front | back) & (det != 0.0f) & (t > 0.0f) & (t <= r.t);
+                    if (!__builtin_reduce_or(met)) continue;
+                    for (int i = 0; i < 4; ++i) {
+                        const int primitive = ((const int*)(block + 36))[i];
+                        if (met[i] && (t[i] < r.t || (t[i] == r.t && primitive < r.primitive))) {
+                            r.t = t[i];
+                            r.u = weight_a[i];
+                            r.v = weight_b[i];
+                            r.primitive = primitive;
+                            FOUND
+                        }
+                    }
+                }
+            }
+            while (r.size > 0) {
+                --r.size;
+                const int key = r.keys[r.size];
+                if ((key & ~7) <= __builtin_bit_cast(int, r.t)) {
+                    r.link = ((const int*)nodes)[(size_t)r.nodes[r.size] * node_size + 48 + (key & 7)];
+                    const char* const memory = r.link >= 0
+                        ? (const char*)(nodes + (size_t)r.link * node_size)
+                        : (const char*)(blocks + (size_t)(~r.link / MAX_BLOCKS) * block_size);
+                    __builtin_prefetch(memory);
+                    __builtin_prefetch(memory + 64);
+                    __builtin_prefetch(memory + 128);
+                    __builtin_prefetch(memory + 192);
+                    goto turn;
+                }
+            }
+        end:
+            RESULT
+            if (!begin(r)) {
+                --active;
+                if (a < active) { r = rays[active]; --a; }
+            }
+        turn:;
+        }
+    }
+"""
+
+_QUEUED = """
+        const int slot = slots.data[i];
+        const auto &o = origin.data[slot], &d = direction.data[slot];
+        LIMIT
+"""
+
+
+def _stream(source: str, found: str, result: str) -> str:
+    text = _STREAM.replace("SORT\n", "\n                ".join(map(_layer, NETWORK)) + "\n")
+    text = text.replace("SOURCE", source).replace("FOUND", found).replace("RESULT", result)
+    constants = {
+        "IN_FLIGHT": IN_FLIGHT,
+        "STACK_SIZE": STACK_SIZE,
+        "NODE_VECTORS": NODE_VECTORS,
+        "BLOCK_VECTORS": BLOCK_VECTORS,
+        "MAX_BLOCKS": MAX_BLOCKS,
+        "NEAR_SLACK": f"{float(NEAR_SLACK)}f",
+        "FAR_SLACK": f"{float(FAR_SLACK)}f",
+        "STEEPEST": f"{float(STEEPEST)}f",
+    }
+    for name, value in constants.items():
+        text = text.replace(name, str(value))
+    return text
+
+
+@wp.func_native(
+    _stream(
+        _QUEUED.replace("LIMIT", "const float limit = 3.0e38f;"),
+        "",
+        """{
+                const int slot = slots.data[r.index];
+                primitive.data[slot] = r.primitive;
+                t.data[slot] = r.t;
+                uv.data[slot][0] = r.u;
+                uv.data[slot][1] = r.v;
+            }""",
+    )
+)
+def closest_triangles(
+    bvh: Bvh,
+    root: int,
+    slots: wp.array[wp.int32],
+    count: int,
+    origin: wp.array[wp.vec3],
+    direction: wp.array[wp.vec3],
+    # out
+    primitive: wp.array[wp.int32],
+    t: wp.array[wp.float32],
+    uv: wp.array[wp.vec2],
+):
+    """First triangles that `count` queued rays meet: numbers (-1: none), distances, weights of the vertices 0 and 1."""
+    ...
+
+
+@wp.func_native(
+    _stream(
+        _QUEUED.replace("LIMIT", "const float limit = t_max.data[slot];"),
+        "goto end;",
+        "blocked.data[slots.data[r.index]] = r.primitive >= 0;",
+    )
+)
+def any_triangles(
+    bvh: Bvh,
+    root: int,
+    slots: wp.array[wp.int32],
+    count: int,
+    origin: wp.array[wp.vec3],
+    direction: wp.array[wp.vec3],
+    t_max: wp.array[wp.float32],
+    # out
+    blocked: wp.array[wp.int32],
+):
+    """Whether queued rays meet a triangle before `t_max`: 1 or 0."""
+    ...

@@ -1,0 +1,194 @@
+"""Rays against hierarchies in plain Warp, on either device: slabs of eight boxes, and a watertight triangle test.
+
+What is computed, and in which order of roundings, is the same in `wavefront.accel.stream`: of equal distances the
+triangle of the lowest number wins, so a hit depends on neither the order of traversal nor the device.
+"""
+
+import warp as wp
+
+from wavefront.accel.bvh import BLOCK, BLOCK_VECTORS, MAX_BLOCKS, NODE_VECTORS, STACK_SIZE, Bvh, Extents
+from wavefront.accel.collapse import WIDTH
+
+# Slope of a direction along a plane: finite, for 0 times infinity is no distance, and so great that even 1e-17 m, such
+# as roundings leave of a zero, times it is beyond all hits.
+STEEPEST = wp.constant(8.0e37)
+# Relative slack of the sides of a box: three roundings of the slab test (Ize 2013), and those of the triangle test.
+# With it the box of a triangle is not behind it, and of triangles at all but one distance the order of visits chooses
+# none.
+NEAR_SLACK = wp.constant(0.999998)
+FAR_SLACK = wp.constant(1.000002)
+
+Links = wp.types.vector(length=STACK_SIZE, dtype=wp.int32)
+Distances = wp.types.vector(length=STACK_SIZE, dtype=wp.float32)
+
+
+@wp.struct
+class Shear:
+    """The map that makes a ray the z axis: axes kx, ky, kz of the world, the last the longest of the direction."""
+
+    kx: wp.int32
+    ky: wp.int32
+    kz: wp.int32
+    x: wp.float32
+    y: wp.float32
+    z: wp.float32
+
+
+@wp.struct
+class TriangleHit:
+    t: wp.float32
+    primitive: wp.int32  # -1: none
+    u: wp.float32  # weights of the first and second vertex
+    v: wp.float32
+
+
+@wp.func
+def slope(d: float) -> float:
+    """1 / d, finite."""
+    if wp.abs(d) < 1.0 / STEEPEST:
+        return wp.where(d < 0.0 or 1.0 / d < 0.0, -STEEPEST, STEEPEST)  # 1 / -0 is negative
+    return 1.0 / d
+
+
+@wp.func
+def slopes(direction: wp.vec3) -> wp.vec3:
+    return wp.vec3(slope(direction[0]), slope(direction[1]), slope(direction[2]))
+
+
+@wp.func
+def make_shear(d: wp.vec3) -> Shear:
+    """See Woop, Benthin and Wald 2013, section 3.2."""
+    s = Shear()
+    s.kz = 0
+    if wp.abs(d[1]) > wp.abs(d[s.kz]):
+        s.kz = 1
+    if wp.abs(d[2]) > wp.abs(d[s.kz]):
+        s.kz = 2
+    s.kx = (s.kz + 1) % 3
+    s.ky = (s.kx + 1) % 3
+    if d[s.kz] < 0.0:  # keeps the winding
+        k = s.kx
+        s.kx = s.ky
+        s.ky = k
+    s.x = d[s.kx] / d[s.kz]
+    s.y = d[s.ky] / d[s.kz]
+    s.z = 1.0 / d[s.kz]
+    return s
+
+
+@wp.func
+def box_distances(bvh: Bvh, node: int, origin: wp.vec3, slope: wp.vec3, t_max: float) -> Extents:
+    """Where a ray enters the boxes of the children of a node; infinite where it does not before `t_max`."""
+    found = Extents()
+    near = Extents(0.0)
+    far = Extents(t_max)
+    for axis in range(3):
+        for half in range(2):
+            lower = bvh.nodes[NODE_VECTORS * node + 2 * axis + half]
+            upper = bvh.nodes[NODE_VECTORS * node + 6 + 2 * axis + half]
+            if slope[axis] < 0.0:
+                swap = lower
+                lower = upper
+                upper = swap
+            for i in range(4):
+                near[4 * half + i] = wp.max(near[4 * half + i], (lower[i] - origin[axis]) * (slope[axis] * NEAR_SLACK))
+                far[4 * half + i] = wp.min(far[4 * half + i], (upper[i] - origin[axis]) * (slope[axis] * FAR_SLACK))
+    for k in range(WIDTH):
+        found[k] = wp.where(near[k] <= far[k], near[k], float(wp.inf))
+    return found
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const float cd = __fmul_rn(c, d);
+    return __fmaf_rn(a, b, -cd) + __fmaf_rn(-c, d, cd);
+#else
+    const float cd = c * d;
+    return __builtin_fmaf(a, b, -cd) + __builtin_fmaf(-c, d, cd);
+#endif
+""")
+def difference_of_products(a: float, b: float, c: float, d: float) -> float:
+    """a b - c d to 1.5 units in the last place (Kahan; Jeannerod, Louvet and Muller 2013), and so of the right sign.
+
+    Two triangles with a common edge see it with opposite signs, and no ray passes between them. And the distance keeps
+    its digits in slivers, where the products all but cancel.
+    """
+    ...
+
+
+@wp.func
+def test_triangle(bvh: Bvh, block: int, k: int, origin: wp.vec3, shear: Shear, nearest: TriangleHit) -> TriangleHit:
+    """A triangle of a block, or the nearest that the ray met before, if that is nearer."""
+    hit = nearest
+    kx = shear.kx
+    ky = shear.ky
+    kz = shear.kz
+    az = bvh.blocks[block + kz][k] - origin[kz]
+    bz = bvh.blocks[block + 3 + kz][k] - origin[kz]
+    cz = bvh.blocks[block + 6 + kz][k] - origin[kz]
+    ax = (bvh.blocks[block + kx][k] - origin[kx]) - shear.x * az
+    ay = (bvh.blocks[block + ky][k] - origin[ky]) - shear.y * az
+    bx = (bvh.blocks[block + 3 + kx][k] - origin[kx]) - shear.x * bz
+    by = (bvh.blocks[block + 3 + ky][k] - origin[ky]) - shear.y * bz
+    cx = (bvh.blocks[block + 6 + kx][k] - origin[kx]) - shear.x * cz
+    cy = (bvh.blocks[block + 6 + ky][k] - origin[ky]) - shear.y * cz
+    u = difference_of_products(cx, by, cy, bx)
+    v = difference_of_products(ax, cy, ay, cx)
+    w = difference_of_products(bx, ay, by, ax)
+    inside = (u >= 0.0 and v >= 0.0 and w >= 0.0) or (u <= 0.0 and v <= 0.0 and w <= 0.0)
+    det = u + v + w
+    if inside and det != 0.0:
+        # Weights first: products of three lengths leave the range of float32 at 1e12.
+        u /= det
+        v /= det
+        t = shear.z * (u * az + v * bz + (w / det) * cz)
+        if t > 0.0 and t <= hit.t:
+            primitive = bvh.primitives[block + 9][k]
+            if t < hit.t or primitive < hit.primitive:
+                hit.t = t
+                hit.primitive = primitive
+                hit.u = u
+                hit.v = v
+    return hit
+
+
+@wp.func
+def trace_triangles(
+    bvh: Bvh, root: int, origin: wp.vec3, direction: wp.vec3, t_max: float, any_will_do: bool
+) -> TriangleHit:
+    """The first triangle below a node that a ray meets before `t_max`, or any."""
+    hit = TriangleHit()
+    hit.t = t_max
+    hit.primitive = -1
+    slope = slopes(direction)
+    shear = make_shear(direction)
+    # What waits.
+    links = Links()
+    distances = Distances()
+    links[0] = root
+    size = int(1)
+    while size > 0:
+        size -= 1
+        link = links[size]
+        if distances[size] <= hit.t:
+            if link >= 0:
+                entered = box_distances(bvh, link, origin, slope, hit.t)
+                bottom = size
+                for k in range(WIDTH):
+                    t = entered[k]
+                    if t <= hit.t:
+                        # The nearest so far stays on top.
+                        place = wp.where(size > bottom and t > distances[wp.max(size - 1, 0)], size - 1, size)
+                        links[size] = links[place]
+                        distances[size] = distances[place]
+                        links[place] = bvh.links[NODE_VECTORS * link + 12 + k // 4][k % 4]
+                        distances[place] = t
+                        size += 1
+            else:
+                first = ~link // MAX_BLOCKS
+                for block in range(first, first + ~link % MAX_BLOCKS + 1):
+                    for k in range(BLOCK):
+                        hit = test_triangle(bvh, BLOCK_VECTORS * block, k, origin, shear, hit)
+                if any_will_do and hit.primitive >= 0:
+                    size = 0
+    return hit
