@@ -6,6 +6,7 @@ take turns, and can be compared answer by answer.
 
 from __future__ import annotations
 
+import abc
 import ctypes
 import dataclasses
 import functools
@@ -52,7 +53,7 @@ class Answer:
     blocked: np.ndarray | None = None
 
 
-class Structure:
+class Structure(abc.ABC):
     """A hierarchy over triangles.
 
     Attributes:
@@ -63,25 +64,25 @@ class Structure:
     name: str
     engines: tuple[str, ...]
 
+    @abc.abstractmethod
     def prepare(self, points: np.ndarray, faces: np.ndarray) -> None:
         """Takes the triangles; not timed."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def build(self) -> None:
         """Builds the hierarchy, to the end."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def release(self) -> None:
         """Lets go of the hierarchy."""
-        raise NotImplementedError
 
     def statistics(self) -> dict | None:
         """What the hierarchy tells of itself."""
         return None
 
+    @abc.abstractmethod
     def query(self, engine: str, rays: Rays, any_hit: bool):
         """Something with `run()`, which is timed, and `answer()`, an `Answer`."""
-        raise NotImplementedError
 
 
 # --- on Warp -----------------------------------------------------------------------------------------------------
