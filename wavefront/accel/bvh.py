@@ -1,10 +1,12 @@
 """Hierarchies with eight children a node, over triangles and over boxes, as the traversal reads them.
 
-A node is 16 vectors of four: for the lower x of its children two, for y and z as many, then for the upper corners, then
-two with the links (see `wavefront.accel.collapse.link`). A leaf is one or two blocks of four triangles: the x of their
-first vertices, then y and z, then those of the second and third vertices, then the indices of the triangles; places
-without a triangle hold NaN. So that eight boxes or four triangles are tested at once, each with one vector instruction
-a coordinate. Corners are exact, not quantised.
+A node is 96 bytes, after Ylitie, Karras and Laine (2017): the origin of a grid, the exponents of its three cell widths,
+eight links (see `wavefront.accel.collapse.link`), and the corners of the boxes of its children in cells, a byte each:
+the lower x of all eight, then y and z, then the upper ones. The grid is one that float32 holds exactly, so that a corner
+is exact however it is computed, and boxes are rounded outwards by at most a cell. A leaf is one or two blocks of four
+triangles: the x of their first vertices, then y and z, then those of the second and third vertices, then the indices of
+the triangles; places without a triangle hold NaN. So that eight boxes or four triangles are tested at once, each with
+one vector instruction a coordinate.
 """
 
 from __future__ import annotations
@@ -21,14 +23,20 @@ from wavefront.accel.collapse import BLOCK_COST, EMPTY, NODE_COST, WIDTH, Childr
 
 BLOCK = 4  # triangles of a block
 MAX_BLOCKS = 2  # of a leaf
-NODE_VECTORS = 16
+NODE_VECTORS = 6
 BLOCK_VECTORS = 10
 MAX_LEVELS = 22  # of a hierarchy
 STACK_SIZE = 160  # entries a traversal needs: a level leaves seven nodes for later, and the last eight
+CELLS = wp.constant(255.0)  # of the grid of a node along an axis
+# Widths of cells, in metres: none so small that a ray along a box's side would leave it at once (see
+# `wavefront.accel.traverse.STEEPEST`), none beyond what float32 holds.
+MIN_EXPONENT = wp.constant(127 - 56)
+MAX_EXPONENT = wp.constant(254)
 
 wp.set_module_options({"enable_backward": False})
 
 Extents = wp.types.vector(length=WIDTH, dtype=wp.float32)
+Corners = wp.types.matrix(shape=(3, WIDTH), dtype=wp.float32)
 
 
 @wp.struct
@@ -123,7 +131,39 @@ def write_links(links: wp.array[Children], node_offset: int, block_offset: int, 
             link += node_offset
         elif link != EMPTY:
             link -= block_offset
-        bvh.links[NODE_VECTORS * (node_offset + i) + 12 + k // 4][k % 4] = link
+        bvh.links[NODE_VECTORS * (node_offset + i) + 1 + k // 4][k % 4] = link
+
+
+@wp.func
+def cell_below(x: float, width: float) -> float:
+    """The cell of a grid, counted from zero, whose lower end is strictly below x.
+
+    Strictly, so that a ray within the side of a box is within the box.
+    """
+    return wp.ceil(x / width) - 1.0
+
+
+@wp.func
+def cell_above(x: float, width: float) -> float:
+    return wp.floor(x / width) + 1.0
+
+
+@wp.func
+def grid_exponent(lower: float, upper: float) -> int:
+    """Biased exponent of the least power of two of which `CELLS` cover an interval.
+
+    And of which the corners are multiples by less than 2^24, so that the grid is exact: its width times a byte added to
+    its origin rounds nothing.
+    """
+    # Halves, for the extent may overflow.
+    width = wp.max((0.5 * upper - 0.5 * lower) / 128.0, wp.max(wp.abs(lower), wp.abs(upper)) / 4194304.0)
+    exponent = wp.max(wp.cast(width, wp.int32) >> 23, MIN_EXPONENT)
+    while exponent < MAX_EXPONENT:
+        width = wp.cast(exponent << 23, wp.float32)
+        if cell_above(upper, width) - cell_below(lower, width) <= CELLS:
+            break
+        exponent += 1
+    return exponent
 
 
 @wp.kernel
@@ -134,26 +174,63 @@ def fit_nodes(
     max_blocks: int,
     first_block: int,
     first_node: int,
+    offset: int,
+    # in and out
+    node_lower: wp.array[wp.vec3],
+    node_upper: wp.array[wp.vec3],
 ):
-    """Boxes of the children of the nodes of one level, from those of blocks and of the level below."""
-    node = NODE_VECTORS * (first_node + wp.tid())
+    """Boxes of the nodes of one level and of their children, from those of blocks and of the level below.
+
+    Those of nodes, from `first_node` on, are exact: what one level was rounded by is not rounded again by the next.
+    """
+    i = offset + wp.tid()
+    node = NODE_VECTORS * (first_node + i)
+    low = Corners(wp.inf)
+    high = Corners(-wp.inf)
+    box_lower = wp.vec3(wp.inf)
+    box_upper = wp.vec3(-wp.inf)
     for k in range(WIDTH):
-        link = bvh.links[node + 12 + k // 4][k % 4]
-        low = wp.vec3(wp.inf)
-        high = wp.vec3(-wp.inf)
+        link = bvh.links[node + 1 + k // 4][k % 4]
+        child_lower = wp.vec3(wp.inf)
+        child_upper = wp.vec3(-wp.inf)
         if link >= 0:
-            for axis in range(3):
-                side = NODE_VECTORS * link + 2 * axis
-                low[axis] = wp.min(wp.min(bvh.nodes[side]), wp.min(bvh.nodes[side + 1]))
-                high[axis] = wp.max(wp.max(bvh.nodes[side + 6]), wp.max(bvh.nodes[side + 7]))
+            child_lower = node_lower[link - first_node]
+            child_upper = node_upper[link - first_node]
         elif link != EMPTY:
             first = ~link // max_blocks - first_block
             for b in range(first, first + ~link % max_blocks + 1):
-                low = wp.min(low, lower[b])
-                high = wp.max(high, upper[b])
+                child_lower = wp.min(child_lower, lower[b])
+                child_upper = wp.max(child_upper, upper[b])
         for axis in range(3):
-            bvh.nodes[node + 2 * axis + k // 4][k % 4] = low[axis]
-            bvh.nodes[node + 6 + 2 * axis + k // 4][k % 4] = high[axis]
+            low[axis, k] = child_lower[axis]
+            high[axis, k] = child_upper[axis]
+        box_lower = wp.min(box_lower, child_lower)
+        box_upper = wp.max(box_upper, child_upper)
+    node_lower[i] = box_lower
+    node_upper[i] = box_upper
+    exponents = int(0)
+    for axis in range(3):
+        exponent = grid_exponent(box_lower[axis], box_upper[axis])
+        exponents |= exponent << (8 * axis)
+        width = wp.cast(exponent << 23, wp.float32)
+        origin = cell_below(box_lower[axis], width)
+        bvh.nodes[node][axis] = origin * width
+        for half in range(2):
+            lower_cells = int(0)
+            upper_cells = int(0)
+            for j in range(4):
+                k = 4 * half + j
+                # A place without a child has a box inside out, which few rays meet; its link tells.
+                first_cell = int(CELLS)
+                last_cell = int(0)
+                if low[axis, k] <= high[axis, k]:
+                    first_cell = int(cell_below(low[axis, k], width) - origin)
+                    last_cell = int(cell_above(high[axis, k], width) - origin)
+                lower_cells |= first_cell << (8 * j)
+                upper_cells |= last_cell << (8 * j)
+            bvh.links[node + 3 + (2 * axis + half) // 4][(2 * axis + half) % 4] = lower_cells
+            bvh.links[node + 3 + (6 + 2 * axis + half) // 4][(6 + 2 * axis + half) % 4] = upper_cells
+    bvh.links[node][3] = exponents
 
 
 @dataclasses.dataclass(frozen=True)
@@ -212,25 +289,28 @@ class _Hierarchy:
         wp.launch(write_links, self.node_count, inputs=inputs, device=self.device)
 
     def _fit(self, write, inputs: list) -> None:
-        lower, upper = (wp.empty(self.block_count, dtype=wp.vec3, device=self.device) for _ in range(2))
-        wp.launch(write, self.block_count, inputs=inputs, outputs=[self.bvh, lower, upper], device=self.device)
-        levels = self.wide.levels
-        for first, end in reversed(list(itertools.pairwise(levels))):
-            inputs = [self.bvh, lower, upper, self.max_blocks, self.first_block, self.first_node + first]
+        blocks, nodes = (
+            [wp.empty(count, dtype=wp.vec3, device=self.device) for _ in range(2)]
+            for count in (self.block_count, self.node_count)
+        )
+        wp.launch(write, self.block_count, inputs=inputs, outputs=[self.bvh, *blocks], device=self.device)
+        for first, end in reversed(list(itertools.pairwise(self.wide.levels))):
+            inputs = [self.bvh, *blocks, self.max_blocks, self.first_block, self.first_node, first, *nodes]
             wp.launch(fit_nodes, end - first, inputs=inputs, device=self.device)
 
     def statistics(self) -> Statistics:
         """Reads the tables back; takes time."""
-        nodes = self.bvh.nodes.numpy().reshape(-1, 8 * WIDTH)[self.first_node : self.first_node + self.node_count]
-        lower, upper = (
-            nodes[:, : 3 * WIDTH].reshape(-1, 3, WIDTH),
-            nodes[:, 3 * WIDTH : 6 * WIDTH].reshape(-1, 3, WIDTH),
-        )
-        links = nodes[:, 6 * WIDTH : 7 * WIDTH].view(np.int32)
+        nodes = self.bvh.links.numpy().reshape(-1, 4 * NODE_VECTORS)
+        nodes = nodes[self.first_node : self.first_node + self.node_count]
+        # The origins of grids do not count.
+        width = np.ldexp(1.0, (nodes[:, 3:4] >> (0, 8, 16) & 255) - 127)
+        cells = nodes[:, 12:].copy().view(np.uint8).reshape(-1, 2, 3, WIDTH)
+        lower, upper = (cells[:, i] * width[:, :, None] for i in range(2))
+        links = nodes[:, 4:12]
         used = links != EMPTY
-        d = np.where(used[:, None], upper.astype(np.float64) - lower, 0.0)
+        d = np.where(used[:, None], upper - lower, 0.0)
         areas = d[:, 0] * d[:, 1] + d[:, 1] * d[:, 2] + d[:, 2] * d[:, 0]
-        d = upper[0].max(axis=1).astype(np.float64) - lower[0].min(axis=1)
+        d = upper[0].max(axis=1) - lower[0].min(axis=1)
         root = d[0] * d[1] + d[1] * d[2] + d[2] * d[0]
         leaves = used & (links < 0)
         blocks = np.where(leaves, ~links % self.max_blocks + 1, 0)

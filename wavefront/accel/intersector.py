@@ -10,7 +10,7 @@ from typing import NamedTuple
 import warp as wp
 
 from wavefront.accel.bvh import NODE_VECTORS
-from wavefront.accel.collapse import WIDTH
+from wavefront.accel.collapse import EMPTY, WIDTH
 from wavefront.accel.geometry import INFINITE, Geometry, hit_type
 from wavefront.accel.instance import point_to_local
 from wavefront.accel.spheres import any_sphere, closest_sphere
@@ -193,10 +193,10 @@ def make_intersector(
                                 place = wp.where(size > bottom and entered[i] > distances[last], last, size)
                                 links[size] = links[place]
                                 distances[size] = distances[place]
-                                links[place] = geometry.instance_bvh.links[NODE_VECTORS * link + 12 + i // 4][i % 4]
+                                links[place] = geometry.instance_bvh.links[NODE_VECTORS * link + 1 + i // 4][i % 4]
                                 distances[place] = entered[i]
                                 size += 1
-                    else:
+                    elif link != EMPTY:
                         k = geometry.instance_bvh.primitives[~link][0]
                         hit = closest_in_group(geometry, k, origin, direction, hit)
         return hit
@@ -217,9 +217,9 @@ def make_intersector(
                     entered = box_distances(geometry.instance_bvh, link, origin, slope, t_max)
                     for i in range(WIDTH):
                         if entered[i] <= t_max:
-                            links[size] = geometry.instance_bvh.links[NODE_VECTORS * link + 12 + i // 4][i % 4]
+                            links[size] = geometry.instance_bvh.links[NODE_VECTORS * link + 1 + i // 4][i % 4]
                             size += 1
-                else:
+                elif link != EMPTY:
                     k = geometry.instance_bvh.primitives[~link][0]
                     if any_in_group(geometry, k, origin, direction, t_max):
                         return True

@@ -12,6 +12,7 @@ The C++ uses the vector types of Clang, which compiles kernels for the CPU devic
 import warp as wp
 
 from wavefront.accel.bvh import BLOCK_VECTORS, MAX_BLOCKS, NODE_VECTORS, STACK_SIZE, Bvh
+from wavefront.accel.collapse import EMPTY
 from wavefront.accel.traverse import FAR_SLACK, NEAR_SLACK, STEEPEST
 
 IN_FLIGHT = 16  # rays; 4 gain half of what 16 do on a million triangles, and more little (README, bench_accel)
@@ -47,13 +48,14 @@ _STREAM = """
     typedef float float4 __attribute__((ext_vector_type(4), aligned(16)));
     typedef int int8 __attribute__((ext_vector_type(8), aligned(4)));
     typedef int int4 __attribute__((ext_vector_type(4), aligned(16)));
+    typedef unsigned char bytes8 __attribute__((ext_vector_type(8), aligned(8)));
     typedef bool bool8 __attribute__((ext_vector_type(8)));
     constexpr int node_size = 4 * NODE_VECTORS, block_size = 4 * BLOCK_VECTORS;  // floats
     const float* const nodes = (const float*)bvh.nodes.data;
     const float* const blocks = (const float*)bvh.blocks.data;
     struct Ray {
         float o[3], near_slope[3], far_slope[3];
-        int near_side[3], far_side[3];  // floats from the beginning of a node
+        int near_side[3], far_side[3];  // bytes from the beginning of a node
         int kx, ky, kz;
         float shear_x, shear_y, shear_z;
         float t, u, v;
@@ -74,8 +76,8 @@ _STREAM = """
             const float slope = along ? __builtin_copysignf(STEEPEST, d[k]) : 1.0f / d[k];
             r.near_slope[k] = slope * NEAR_SLACK;
             r.far_slope[k] = slope * FAR_SLACK;
-            r.near_side[k] = 8 * k + (slope < 0.0f ? 24 : 0);
-            r.far_side[k] = 8 * k + (slope < 0.0f ? 0 : 24);
+            r.near_side[k] = 48 + 8 * k + (slope < 0.0f ? 24 : 0);
+            r.far_side[k] = 48 + 8 * k + (slope < 0.0f ? 0 : 24);
         }
         r.kz = 0;
         if (__builtin_fabsf(d[1]) > __builtin_fabsf(d[r.kz])) r.kz = 1;
@@ -105,12 +107,21 @@ _STREAM = """
             Ray& r = rays[a];
             if (r.link >= 0) {
                 const float* const node = nodes + (size_t)r.link * node_size;
-                const float8 nx = (*(const float8*)(node + r.near_side[0]) - r.o[0]) * r.near_slope[0];
-                const float8 ny = (*(const float8*)(node + r.near_side[1]) - r.o[1]) * r.near_slope[1];
-                const float8 nz = (*(const float8*)(node + r.near_side[2]) - r.o[2]) * r.near_slope[2];
-                const float8 fx = (*(const float8*)(node + r.far_side[0]) - r.o[0]) * r.far_slope[0];
-                const float8 fy = (*(const float8*)(node + r.far_side[1]) - r.o[1]) * r.far_slope[1];
-                const float8 fz = (*(const float8*)(node + r.far_side[2]) - r.o[2]) * r.far_slope[2];
+                const int exponents = ((const int*)node)[3];
+                auto side = [&](int axis, int place) -> float8 {
+                    const float width = __builtin_bit_cast(float, (exponents >> 8 * axis & 255) << 23);
+                    const bytes8 cells = *(const bytes8*)((const char*)node + place);
+                    // Exact.
+                    const float8 corners = __builtin_elementwise_fma(
+                        __builtin_convertvector(cells, float8), (float8)(width), (float8)(node[axis]));
+                    return corners - r.o[axis];
+                };
+                const float8 nx = side(0, r.near_side[0]) * r.near_slope[0];
+                const float8 ny = side(1, r.near_side[1]) * r.near_slope[1];
+                const float8 nz = side(2, r.near_side[2]) * r.near_slope[2];
+                const float8 fx = side(0, r.far_side[0]) * r.far_slope[0];
+                const float8 fy = side(1, r.far_side[1]) * r.far_slope[1];
+                const float8 fz = side(2, r.far_side[2]) * r.far_slope[2];
                 float8 near = nx > ny ? nx : ny, far = fx < fy ? fx : fy;
                 near = near > nz ? near : nz;
                 far = far < fz ? far : fz;
@@ -165,14 +176,14 @@ _STREAM = """
                 --r.size;
                 const int key = r.keys[r.size];
                 if ((key & ~7) <= __builtin_bit_cast(int, r.t)) {
-                    r.link = ((const int*)nodes)[(size_t)r.nodes[r.size] * node_size + 48 + (key & 7)];
+                    r.link = ((const int*)nodes)[(size_t)r.nodes[r.size] * node_size + 4 + (key & 7)];
+                    if (r.link == EMPTY) continue;
                     const char* const memory = r.link >= 0
                         ? (const char*)(nodes + (size_t)r.link * node_size)
                         : (const char*)(blocks + (size_t)(~r.link / MAX_BLOCKS) * block_size);
                     __builtin_prefetch(memory);
                     __builtin_prefetch(memory + 64);
                     __builtin_prefetch(memory + 128);
-                    __builtin_prefetch(memory + 192);
                     goto turn;
                 }
             }
@@ -203,6 +214,7 @@ def _stream(source: str, found: str, result: str) -> str:
         "NODE_VECTORS": NODE_VECTORS,
         "BLOCK_VECTORS": BLOCK_VECTORS,
         "MAX_BLOCKS": MAX_BLOCKS,
+        "EMPTY": f"({EMPTY + 1} - 1)",
         "NEAR_SLACK": f"{float(NEAR_SLACK)}f",
         "FAR_SLACK": f"{float(FAR_SLACK)}f",
         "STEEPEST": f"{float(STEEPEST)}f",

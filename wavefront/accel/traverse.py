@@ -7,7 +7,7 @@ triangle of the lowest number wins, so a hit depends on neither the order of tra
 import warp as wp
 
 from wavefront.accel.bvh import BLOCK, BLOCK_VECTORS, MAX_BLOCKS, NODE_VECTORS, STACK_SIZE, Bvh, Extents
-from wavefront.accel.collapse import WIDTH
+from wavefront.accel.collapse import EMPTY, WIDTH
 
 # Slope of a direction along a plane: finite, for 0 times infinity is no distance, and so great that even 1e-17 m, such
 # as roundings leave of a zero, times it is beyond all hits.
@@ -82,17 +82,26 @@ def box_distances(bvh: Bvh, node: int, origin: wp.vec3, slope: wp.vec3, t_max: f
     found = Extents()
     near = Extents(0.0)
     far = Extents(t_max)
+    place = NODE_VECTORS * node
+    grid = bvh.nodes[place]
+    exponents = bvh.links[place][3]
     for axis in range(3):
+        width = wp.cast(((exponents >> (8 * axis)) & 255) << 23, wp.float32)
         for half in range(2):
-            lower = bvh.nodes[NODE_VECTORS * node + 2 * axis + half]
-            upper = bvh.nodes[NODE_VECTORS * node + 6 + 2 * axis + half]
+            word = 2 * axis + half
+            near_cells = bvh.links[place + 3 + word // 4][word % 4]
+            far_cells = bvh.links[place + 3 + (6 + word) // 4][(6 + word) % 4]
             if slope[axis] < 0.0:
-                swap = lower
-                lower = upper
-                upper = swap
+                swap = near_cells
+                near_cells = far_cells
+                far_cells = swap
             for i in range(4):
-                near[4 * half + i] = wp.max(near[4 * half + i], (lower[i] - origin[axis]) * (slope[axis] * NEAR_SLACK))
-                far[4 * half + i] = wp.min(far[4 * half + i], (upper[i] - origin[axis]) * (slope[axis] * FAR_SLACK))
+                # Exact.
+                near_side = grid[axis] + float((near_cells >> (8 * i)) & 255) * width
+                far_side = grid[axis] + float((far_cells >> (8 * i)) & 255) * width
+                k = 4 * half + i
+                near[k] = wp.max(near[k], (near_side - origin[axis]) * (slope[axis] * NEAR_SLACK))
+                far[k] = wp.min(far[k], (far_side - origin[axis]) * (slope[axis] * FAR_SLACK))
     for k in range(WIDTH):
         found[k] = wp.where(near[k] <= far[k], near[k], float(wp.inf))
     return found
@@ -181,10 +190,10 @@ def trace_triangles(
                         place = wp.where(size > bottom and t > distances[wp.max(size - 1, 0)], size - 1, size)
                         links[size] = links[place]
                         distances[size] = distances[place]
-                        links[place] = bvh.links[NODE_VECTORS * link + 12 + k // 4][k % 4]
+                        links[place] = bvh.links[NODE_VECTORS * link + 1 + k // 4][k % 4]
                         distances[place] = t
                         size += 1
-            else:
+            elif link != EMPTY:
                 first = ~link // MAX_BLOCKS
                 for block in range(first, first + ~link % MAX_BLOCKS + 1):
                     for k in range(BLOCK):
