@@ -110,6 +110,27 @@ def test_of_equal_triangles_the_first_is_hit():
         assert (getattr(alone, name) == getattr(hits, name)).all(), name
 
 
+def test_rays_within_the_sides_of_boxes_hit_the_edges_there():
+    """Along an axis, through the border of a sheet, which is that of all boxes around it."""
+    rng = np.random.default_rng(3)
+    x = np.linspace(-1.0, 1.0, 21)
+    square = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]])
+    cells = np.stack(np.meshgrid(range(20), range(20)), axis=-1).reshape(-1, 1, 1, 2) + square
+    sheet = np.full((800, 3, 3), 0.25)
+    sheet[:, :, :2] = x[cells].reshape(800, 3, 2)
+    border = rng.uniform(-1.0, 1.0, (4000, 2))
+    side = rng.integers(0, 2, 4000)
+    border[np.arange(4000), side] = rng.choice((-1.0, 1.0), 4000)
+    for axis in range(3):
+        origin = np.column_stack([border, np.full(4000, 3.0)])
+        direction = np.array([0.0, 0.0, -1.0])
+        corners, origin, direction = (np.roll(a, axis, axis=-1) for a in (sheet, origin, direction))
+        directions = np.where(direction == 0.0, np.copysign(0.0, rng.normal(size=(4000, 3))), direction)
+        hits = trace_both(soup_bvh(np.float32(corners)).bvh, 0, np.float32(origin), np.float32(directions))
+        assert (hits.primitive >= 0).all()
+        np.testing.assert_allclose(hits.t, 2.75, rtol=4e-7)
+
+
 def test_rays_without_length_and_bounds_without_extent_hit_nothing():
     rng = np.random.default_rng(2)
     corners = SOUPS["scattered"](rng, 50).astype(np.float32)

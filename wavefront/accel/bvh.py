@@ -1,12 +1,12 @@
 """Hierarchies with eight children a node, over triangles and over boxes, as the traversal reads them.
 
-A node is 96 bytes, after Ylitie, Karras and Laine (2017): the origin of a grid, the exponents of its three cell widths,
-eight links (see `wavefront.accel.collapse.link`), and the corners of the boxes of its children in cells, a byte each:
-the lower x of all eight, then y and z, then the upper ones. The grid is one that float32 holds exactly, so that a corner
-is exact however it is computed, and boxes are rounded outwards by at most a cell. A leaf is one or two blocks of four
-triangles: the x of their first vertices, then y and z, then those of the second and third vertices, then the indices of
-the triangles; places without a triangle hold NaN. So that eight boxes or four triangles are tested at once, each with
-one vector instruction a coordinate.
+A node is 96 bytes, much as that of Ylitie, Karras and Laine (2017): the origin of a grid, the exponents of its cell
+widths, eight links (see `wavefront.accel.collapse.link`), and the corners of the boxes of its children in cells, a byte
+each: the lower x of all eight, then y and z, then the upper ones. float32 holds all points of the grid exactly, so that
+a corner is the same however it is computed; boxes are rounded outwards by at most a cell. A leaf is one or two blocks
+of four triangles: the x of their first vertices, then y and z, then those of the second and third vertices, then the
+indices of the triangles; places without a triangle hold NaN. So that eight boxes or four triangles are tested at once,
+each with one vector instruction a coordinate.
 """
 
 from __future__ import annotations
@@ -314,8 +314,8 @@ class _Hierarchy:
         root = d[0] * d[1] + d[1] * d[2] + d[2] * d[0]
         leaves = used & (links < 0)
         blocks = np.where(leaves, ~links % self.max_blocks + 1, 0)
-        node_visits = 1.0 + float(areas[used & ~leaves].sum() / root) if root > 0.0 else 0.0
-        block_visits = float((areas * blocks).sum() / root) if root > 0.0 else 0.0
+        node_visits = 1.0 + float(areas[used & ~leaves].sum() / root)
+        block_visits = float((areas * blocks).sum() / root)
         vectors = self.node_count * NODE_VECTORS + self.block_count * self._block_vectors
         return Statistics(
             primitives=self.wide.order.shape[0],

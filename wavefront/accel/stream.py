@@ -13,23 +13,13 @@ import warp as wp
 
 from wavefront.accel.bvh import BLOCK_VECTORS, MAX_BLOCKS, NODE_VECTORS, STACK_SIZE, Bvh
 from wavefront.accel.collapse import EMPTY
-from wavefront.accel.traverse import FAR_SLACK, NEAR_SLACK, STEEPEST
+from wavefront.accel.traverse import FAR_SLACK, NEAR_SLACK, NETWORK, STEEPEST
 
 IN_FLIGHT = 16  # rays; 4 gain half of what 16 do on a million triangles, and more little (README, bench_accel)
 
-# Pairs of places that a layer of the sorting network exchanges (Knuth 1998, section 5.3.4: 19 comparators, 6 layers).
-NETWORK = (
-    ((0, 2), (1, 3), (4, 6), (5, 7)),
-    ((0, 4), (1, 5), (2, 6), (3, 7)),
-    ((0, 1), (2, 3), (4, 5), (6, 7)),
-    ((2, 4), (3, 5)),
-    ((1, 4), (3, 6)),
-    ((1, 2), (3, 4), (5, 6)),
-)
-
 
 def _layer(pairs) -> str:
-    """C++ that orders pairs of the vector `key`, the greater first."""
+    """C++ of a layer of the sorting network: orders pairs of the vector `key`, the greater first."""
     partner, source = list(range(8)), list(range(8))
     for first, second in pairs:
         partner[first], partner[second] = second, first

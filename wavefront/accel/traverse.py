@@ -6,7 +6,7 @@ triangle of the lowest number wins, so a hit depends on neither the order of tra
 
 import warp as wp
 
-from wavefront.accel.bvh import BLOCK, BLOCK_VECTORS, MAX_BLOCKS, NODE_VECTORS, STACK_SIZE, Bvh, Extents
+from wavefront.accel.bvh import BLOCK, BLOCK_VECTORS, MAX_BLOCKS, MAX_LEVELS, NODE_VECTORS, STACK_SIZE, Bvh, Extents
 from wavefront.accel.collapse import EMPTY, WIDTH
 
 # Slope of a direction along a plane: finite, for 0 times infinity is no distance, and so great that even 1e-17 m, such
@@ -18,6 +18,21 @@ STEEPEST = wp.constant(8.0e37)
 NEAR_SLACK = wp.constant(0.999998)
 FAR_SLACK = wp.constant(1.000002)
 
+# Comparators of a sorting network (Knuth 1998, section 5.3.4), in layers that could run at once.
+NETWORK = (
+    ((0, 2), (1, 3), (4, 6), (5, 7)),
+    ((0, 4), (1, 5), (2, 6), (3, 7)),
+    ((0, 1), (2, 3), (4, 5), (6, 7)),
+    ((2, 4), (3, 5)),
+    ((1, 4), (3, 6)),
+    ((1, 2), (3, 4), (5, 6)),
+)
+COMPARATORS = tuple(pair for layer in NETWORK for pair in layer)
+UNMET = wp.constant(0x7F800000)  # the bits of infinity
+
+Keys = wp.types.vector(length=WIDTH, dtype=wp.int32)
+Levels = wp.types.vector(length=MAX_LEVELS, dtype=wp.int32)
+Waiting = wp.types.vector(length=MAX_LEVELS, dtype=wp.uint32)
 Links = wp.types.vector(length=STACK_SIZE, dtype=wp.int32)
 Distances = wp.types.vector(length=STACK_SIZE, dtype=wp.float32)
 
@@ -162,6 +177,27 @@ def test_triangle(bvh: Bvh, block: int, k: int, origin: wp.vec3, shear: Shear, n
 
 
 @wp.func
+def children_met(bvh: Bvh, node: int, origin: wp.vec3, slope: wp.vec3, t_max: float) -> wp.uint32:
+    """Children of a node that a ray meets before `t_max`: four bits for each, 8 plus its place, the nearest lowest."""
+    entered = box_distances(bvh, node, origin, slope, t_max)
+    keys = Keys()
+    for k in range(WIDTH):
+        # Distances are not negative, and so their bits are in the order of their values.
+        keys[k] = (wp.cast(entered[k], wp.int32) & ~7) | k
+    for i in range(wp.static(len(COMPARATORS))):
+        a = wp.static(COMPARATORS[i][0])
+        b = wp.static(COMPARATORS[i][1])
+        greater = wp.max(keys[a], keys[b])
+        keys[b] = wp.min(keys[a], keys[b])
+        keys[a] = greater
+    met = wp.uint32(0)
+    for k in range(WIDTH):
+        if keys[k] < UNMET:
+            met = (met << wp.uint32(4)) | wp.uint32(8 | (keys[k] & 7))
+    return met
+
+
+@wp.func
 def trace_triangles(
     bvh: Bvh, root: int, origin: wp.vec3, direction: wp.vec3, t_max: float, any_will_do: bool
 ) -> TriangleHit:
@@ -171,33 +207,30 @@ def trace_triangles(
     hit.primitive = -1
     slope = slopes(direction)
     shear = make_shear(direction)
-    # What waits.
-    links = Links()
-    distances = Distances()
-    links[0] = root
-    size = int(1)
-    while size > 0:
-        size -= 1
-        link = links[size]
-        if distances[size] <= hit.t:
-            if link >= 0:
-                entered = box_distances(bvh, link, origin, slope, hit.t)
-                bottom = size
-                for k in range(WIDTH):
-                    t = entered[k]
-                    if t <= hit.t:
-                        # The nearest so far stays on top.
-                        place = wp.where(size > bottom and t > distances[wp.max(size - 1, 0)], size - 1, size)
-                        links[size] = links[place]
-                        distances[size] = distances[place]
-                        links[place] = bvh.links[NODE_VECTORS * link + 1 + k // 4][k % 4]
-                        distances[place] = t
-                        size += 1
-            elif link != EMPTY:
-                first = ~link // MAX_BLOCKS
-                for block in range(first, first + ~link % MAX_BLOCKS + 1):
-                    for k in range(BLOCK):
-                        hit = test_triangle(bvh, BLOCK_VECTORS * block, k, origin, shear, hit)
-                if any_will_do and hit.primitive >= 0:
-                    size = 0
+    # Nodes with children that wait, one a level: an eighth of the memory of a stack of those children.
+    nodes = Levels()
+    waiting = Waiting()
+    size = int(0)
+    link = int(root)
+    done = bool(False)
+    while not done:
+        if link >= 0:
+            nodes[size] = link
+            waiting[size] = children_met(bvh, link, origin, slope, hit.t)
+            size += 1
+        elif link != EMPTY:
+            first = ~link // MAX_BLOCKS
+            for block in range(first, first + ~link % MAX_BLOCKS + 1):
+                for k in range(BLOCK):
+                    hit = test_triangle(bvh, BLOCK_VECTORS * block, k, origin, shear, hit)
+            if any_will_do and hit.primitive >= 0:
+                size = 0
+        while size > 0 and waiting[wp.max(size - 1, 0)] == wp.uint32(0):
+            size -= 1
+        if size > 0:
+            met = waiting[size - 1]
+            k = int(met & wp.uint32(7))
+            waiting[size - 1] = met >> wp.uint32(4)
+            link = bvh.links[NODE_VECTORS * nodes[size - 1] + 1 + k // 4][k % 4]
+        done = size == 0
     return hit
