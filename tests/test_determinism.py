@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from wavefront import Renderer, load_scene, renderer
+from wavefront import Renderer, load_scene
 from wavefront.integrator import plan_tiles
 
 SCENES = Path(__file__).parent.parent / "scenes"
@@ -41,29 +41,26 @@ def reference(name):
 @pytest.mark.parametrize("threads", [2, 3, 5])
 def test_number_of_threads(name, reference, threads):
     # A small capacity, so that there are tiles for all.
-    r = Renderer(load(name), threads=threads, seed=5, memory=budget(name, threads, 1024))
+    r = Renderer(load(name), threads=threads, seed=5, paths_in_flight=1024 * threads)
     assert len(r.workers) == threads
     np.testing.assert_array_equal(film(r), reference)
     assert np.isfinite(reference).all()
 
 
-def budget(name, threads, capacity):
-    """Bytes that give the film and `threads` workers of this capacity, and nothing more."""
-    probe = Renderer(load(name), threads=1)
-    return 61 * 47 * probe.bytes_per_pixel + capacity * threads * probe.bytes_per_path
-
-
 @pytest.mark.parametrize("capacity", [1024, 1025, 3000, 10_007])
 def test_memory(name, reference, capacity):
-    r = Renderer(load(name), threads=1, seed=5, memory=budget(name, 1, capacity))
+    """A budget for the film and for these paths, and nothing more."""
+    probe = Renderer(load(name), threads=1)
+    budget = 61 * 47 * probe.bytes_per_pixel + capacity * probe.bytes_per_path
+    r = Renderer(load(name), threads=1, seed=5, memory=budget)
     assert r.capacity == capacity
     np.testing.assert_array_equal(film(r), reference)
 
 
-def test_capacity_of_a_whole_pass(name, reference, monkeypatch):
+def test_capacity_of_a_whole_pass(name, reference):
     """One tile holds the whole film, as on CUDA."""
-    monkeypatch.setattr(renderer, "CPU_CAPACITY", 1 << 16)
-    r = Renderer(load(name), threads=1, seed=5)
+    r = Renderer(load(name), threads=1, seed=5, paths_in_flight=1 << 16)
+    assert r.capacity == 1 << 16
     assert len(plan_tiles(61, 47, r.capacity, 0, SPP)) == 1
     np.testing.assert_array_equal(film(r), reference)
 
@@ -109,11 +106,11 @@ def test_samples_and_pixels_differ(name):
     assert (first[both] != second[both]).any(axis=1).mean() > 0.9
 
 
-@pytest.mark.parametrize("capacity", [1024, 1 << 16])
+@pytest.mark.parametrize("capacity", [1024, 1 << 14])
 def test_captured_graph(name, reference, capacity):
     """A recorded pass, replayed with nothing but the tile changed, gives the same bits: the bounce loop ends by what
     the device counts, and no launch depends on what the host has read."""
-    r = Renderer(load(name), threads=1, seed=5, memory=budget(name, 1, capacity))
+    r = Renderer(load(name), threads=1, seed=5, paths_in_flight=capacity)
     worker = r.workers[0]
     graph = worker.capture()
     tiles = plan_tiles(61, 47, worker.capacity, 0, SPP)

@@ -140,6 +140,10 @@ def test_scene_hash_follows_the_scene_not_its_place(scene, tmp_path, capsys):
         (["--time", "0"], "error: --time 0; allowed: more than 0"),
         (["--device", "cuda:7"], "error: unknown device 'cuda:7'; available: cpu"),
         (["--threads", "0"], "error: 0 threads; allowed: 1 or more"),
+        (
+            ["--threads", "2", "--paths-in-flight", "2047"],
+            "error: 2047 paths in flight on 2 threads; allowed: 2048 or more",
+        ),
         (["--seed", "-1"], "error: seed -1 is out of range; allowed: 0 to 2^64 - 1"),
         (["--memory", "10K"], "error: a memory budget of 0 MiB is too small for 384 pixels"),
         (["-o", "missing/out.exr"], "error: missing/out.exr: the folder missing does not exist"),

@@ -32,7 +32,7 @@ from rich.table import Table
 from tools.accel_engines import ENGINES, Answer, Structure, make_structures, memory_in_use, missing
 from tools.accel_plot import write_plot
 from tools.accel_rays import Case, RayMaker, from_scene, generated
-from tools.bench_common import machine, spread
+from tools.bench_common import machine, parse_counts, spread
 from tools.guide_figure import need_matplotlib
 from wavefront.errors import WavefrontError
 from wavefront.output import check_writable
@@ -51,13 +51,7 @@ def parse_sizes(text: str) -> list[int]:
     """Numbers of triangles such as ``1e3,1e6``, or ``none``."""
     if text == "none":
         return []
-    try:
-        sizes = [int(float(part)) for part in text.split(",")]
-    except (ValueError, OverflowError):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a list of numbers such as 1e3,1e6, nor none") from None
-    if not all(FEWEST <= size <= MOST for size in sizes):
-        raise argparse.ArgumentTypeError(f"{text}; allowed: {FEWEST} to {MOST} triangles")
-    return sizes
+    return parse_counts(text, FEWEST, MOST)
 
 
 def parse_engines(text: str) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import platform
@@ -87,6 +88,21 @@ def spread(values: Sequence[float]) -> dict:
 def show(figure: Mapping[str, float], digits: int = 3) -> str:
     """A figure from `spread` as ``median (min to max)``."""
     return "{median:.{d}g} ({min:.{d}g} to {max:.{d}g})".format(d=digits, **figure)
+
+
+def parse_counts(text: str, fewest: int, most: int) -> list[int]:
+    """Numbers such as ``1e3,1e6``.
+
+    Raises:
+        argparse.ArgumentTypeError: Says what is allowed.
+    """
+    try:
+        counts = [int(float(part)) for part in text.split(",")]
+    except (ValueError, OverflowError):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a list of numbers such as 1e3,1e6") from None
+    if not all(fewest <= count <= most for count in counts):
+        raise argparse.ArgumentTypeError(f"{text}; allowed: {fewest} to {most}")
+    return counts
 
 
 def megabytes(size: float) -> str:

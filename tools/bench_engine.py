@@ -1,8 +1,8 @@
 """One renderer, measured in a process of its own: the child of `tools.bench_render`.
 
 Its job is a dict: ``engine`` (``wavefront``, or a variant of Mitsuba), ``scene`` (a file), ``width``, ``height``,
-``max_depth``, ``threads``, ``device``. It answers ``{"do": "start"}``, ``{"do": "measure", "seconds": 5.0}`` and
-``{"do": "finish"}``.
+``max_depth``, ``threads``, ``device``, and for ours ``paths_in_flight`` and ``memory`` if they are not the defaults.
+It answers ``{"do": "start"}``, ``{"do": "measure", "seconds": 5.0}`` and ``{"do": "finish"}``.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ class Wavefront:
 
         begin = time.perf_counter()
         scene = prepared(self.job)
-        self.renderer = Renderer(scene, device=self.job["device"], threads=self.job["threads"])
+        options = ("device", "threads", "memory", "paths_in_flight")
+        self.renderer = Renderer(scene, **{name: self.job[name] for name in options if name in self.job})
         built = time.perf_counter()
         self.renderer.render(spp=1)
         compiled = self.renderer.statistics.compile_seconds

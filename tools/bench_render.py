@@ -20,10 +20,11 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from tools.bench_common import ROOT, Child, machine, megabytes, show, spread
+from tools.bench_common import ROOT, Child, machine, megabytes, parse_counts, show, spread
 from tools.peers import mitsuba as peer
 from wavefront.errors import WavefrontError
 from wavefront.render import parse_size
+from wavefront.renderer import DEFAULT_MEMORY, MIN_CAPACITY
 
 OURS = "wavefront"
 PEERS = {"cpu": ("scalar_rgb", "llvm_ad_rgb"), "cuda": ("cuda_ad_rgb",)}
@@ -34,6 +35,8 @@ SETTINGS = {
     "door-ajar": (320, 180, 10),
 }
 OTHERS = (320, 180, 10)
+MOST_PATHS = 10**8
+BYTES_PER_PATH = 1024  # more than their state takes
 
 
 def default_scenes() -> list[Path]:
@@ -67,6 +70,9 @@ def bench_scene(job: dict, arguments: argparse.Namespace, progress) -> dict:
     engines = {OURS: {**job, "engine": OURS}}
     if arguments.device == "cpu" and arguments.threads > 1:
         engines[f"{OURS}, one thread"] = {**job, "engine": OURS, "threads": 1}
+    for paths in arguments.paths:
+        memory = DEFAULT_MEMORY + BYTES_PER_PATH * paths
+        engines[f"{OURS}, {paths} paths"] = {**job, "engine": OURS, "paths_in_flight": paths, "memory": memory}
     for variant in PEERS["cpu" if arguments.device == "cpu" else "cuda"]:
         reason = peer.missing(variant)
         if reason is None:
@@ -219,6 +225,13 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--size", type=parse_size, metavar="WxH", help="film size; default: 256x256 or 320x180")
     parser.add_argument("--max-depth", type=int, metavar="N", help="longest path in segments; default: 8 or 10")
     parser.add_argument("--device", default="cpu", help="cpu (default), cuda or cuda:N")
+    parser.add_argument(
+        "--paths",
+        type=lambda text: parse_counts(text, MIN_CAPACITY, MOST_PATHS),
+        default=[],
+        metavar="N,...",
+        help="also render with as many paths in flight, such as 1e5,1e6,1e7",
+    )
     parser.add_argument("--no-start", action="store_true", help="leave out compile time and the first image")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
     return parser
@@ -235,6 +248,9 @@ def run(arguments: argparse.Namespace) -> int:
             raise WavefrontError(f"{name} {value}; allowed: {least} or more")
     if not 0.0 < arguments.seconds < 3600.0:
         raise WavefrontError(f"--seconds {arguments.seconds:g}; allowed: more than 0, less than 3600")
+    fewest = MIN_CAPACITY * (arguments.threads if arguments.device == "cpu" else 1)
+    if arguments.paths and min(arguments.paths) < fewest:
+        raise WavefrontError(f"--paths {min(arguments.paths)}; allowed: {fewest} or more with these threads")
     if arguments.max_depth is not None and arguments.max_depth < 1:
         raise WavefrontError(f"--max-depth {arguments.max_depth}; allowed: 1 or more")
     if arguments.json and not arguments.json.resolve().parent.is_dir():

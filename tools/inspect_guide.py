@@ -82,7 +82,7 @@ def build_parser() -> argparse.ArgumentParser:
     machine.add_argument("--memory", type=parse_memory, default="4G", metavar="SIZE", help="most memory; default 4G")
     # The options of wavefront.render that are not for this.
     parser.set_defaults(preset=None, crop=None, aov=None, half=False, no_rr=False, sampler=None)
-    parser.set_defaults(strict=False, profile=False, accel="bvh")
+    parser.set_defaults(strict=False, profile=False, accel="bvh", paths_in_flight=None)
     return parser
 
 

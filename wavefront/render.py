@@ -172,6 +172,9 @@ def build_parser() -> argparse.ArgumentParser:
     )
     machine.add_argument("--threads", type=int, metavar="N", help="workers on the CPU device; default: all cores")
     machine.add_argument(
+        "--paths-in-flight", type=int, metavar="N", help="most paths at a time; default: by the device"
+    )
+    machine.add_argument(
         "--memory",
         type=parse_memory,
         default="4G",
@@ -374,6 +377,7 @@ def make_renderer(arguments: argparse.Namespace, scene: Scene, guide: Guide | No
         on_compile=lambda message: console.print(message, highlight=False),
         guide=guide,
         accel=arguments.accel,
+        paths_in_flight=arguments.paths_in_flight,
     )
 
 

@@ -42,6 +42,7 @@ from wavefront.trace import PathTrace, TraceWorker
 
 CPU_CAPACITY = 1 << 14  # paths in flight per worker: their state stays in a core's second-level cache
 CUDA_CAPACITY = 1 << 21
+MIN_CAPACITY = 1 << 10
 DEFAULT_MEMORY = 4 << 30
 OUTPUT_LIBRARIES = 64 << 20  # code and buffers of what writes images
 PASS_SECONDS = 2.0  # aimed at: passes are where progress, time limits and Ctrl-C are looked at
@@ -121,6 +122,8 @@ class Renderer:
             makes it.
         profile: On CUDA, time every stage, at the price of a synchronisation after each.
         accel: How rays find triangles: ``bvh``, our hierarchy, or ``mesh``, queries of `wp.Mesh`, as a reference.
+        paths_in_flight: Most paths of all workers together, at least `MIN_CAPACITY` a worker; default: `CPU_CAPACITY` a
+            worker, or `CUDA_CAPACITY`. The image does not depend on it.
         on_compile: Called with a message before kernels are compiled.
 
     Attributes:
@@ -148,6 +151,7 @@ class Renderer:
         on_compile: Callable[[str], None] | None = None,
         guide: Guide | msgspec.UnsetType | None = msgspec.UNSET,
         accel: str = "bvh",
+        paths_in_flight: int | None = None,
     ):
         if not 0 <= seed < 2**64:
             raise WavefrontError(f"seed {seed} is out of range; allowed: 0 to 2^64 - 1")
@@ -194,6 +198,12 @@ class Renderer:
         weighted = self.features.weighted
         self.bytes_per_pixel = Film.bytes_per_pixel(aovs, weighted)
         self.bytes_per_path = state_bytes_per_slot(self.features) + (guide.bytes_per_slot() if guide else 0)
+        if paths_in_flight is not None and paths_in_flight < MIN_CAPACITY * self.threads:
+            raise WavefrontError(
+                f"{paths_in_flight} paths in flight on {self.threads} threads; allowed: "
+                f"{MIN_CAPACITY * self.threads} or more"
+            )
+        self._most_paths = paths_in_flight // self.threads if paths_in_flight else None
         pixels, held = window.width * window.height, 0
         if whole_process and self.device == "cpu":
             held = max(resident_bytes() + output_bytes(aovs), peak_memory_bytes() - pixels * self.bytes_per_pixel)
@@ -237,11 +247,10 @@ class Renderer:
             raise WavefrontError(f"a film of {pixels} pixels; allowed: up to 2^31 - 1")
         film = pixels * self.bytes_per_pixel + (self._guiding.nbytes() if self._guiding else 0)
         left = memory - held - film
-        capacity = min(
-            CPU_CAPACITY if self.device == "cpu" else CUDA_CAPACITY, left // (self.bytes_per_path * self.threads)
-        )
-        if capacity < 1024:
-            needed = held + film + 1024 * self.bytes_per_path * self.threads
+        most = self._most_paths or (CPU_CAPACITY if self.device == "cpu" else CUDA_CAPACITY)
+        capacity = min(most, left // (self.bytes_per_path * self.threads))
+        if capacity < MIN_CAPACITY:
+            needed = held + film + MIN_CAPACITY * self.bytes_per_path * self.threads
             owner = "the film and the guide" if self.guide else "the film"
             rest = f", {film / 2**20:.0f} MiB of it for {owner} and {held / 2**20:.0f} MiB for all else" if held else ""
             raise WavefrontError(
