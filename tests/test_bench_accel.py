@@ -224,7 +224,7 @@ def test_bad_input_is_one_line(capsys, arguments, message):
     ("arguments", "message"),
     [
         (["--sizes", "many"], "is not a list of numbers"),
-        (["--sizes", "10"], "allowed: 100 to 100000000 triangles"),
+        (["--sizes", "10"], "allowed: 100 to 100000000"),
         (["--sizes", "nan"], "is not a list of numbers"),
         (["--engines", "optix"], "there is no engine 'optix'"),
     ],
