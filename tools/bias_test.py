@@ -7,7 +7,7 @@ of channels that err together. An image without variance is taken as exact. What
 - The pixels of an image are independent, as with a box filter or a filter that is sampled; those of splatted filters
   are not.
 - The samples are enough for their variance to be known: where a rare path was not found, an image is both too dark and
-  too sure of it. At few samples per pixel, larger tiles help (see the README for what was measured).
+  too sure of it. At few samples per pixel, larger tiles help (see docs/measuring.md for what was measured).
 """
 
 from __future__ import annotations

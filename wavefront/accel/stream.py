@@ -15,7 +15,7 @@ from wavefront.accel.bvh import BLOCK_VECTORS, MAX_BLOCKS, NODE_VECTORS, STACK_S
 from wavefront.accel.collapse import EMPTY
 from wavefront.accel.traverse import FAR_SLACK, NEAR_SLACK, NETWORK, STEEPEST
 
-IN_FLIGHT = 16  # rays; 4 gain half of what 16 do on a million triangles, and more little (README, bench_accel)
+IN_FLIGHT = 16  # rays; 4 gain half of what 16 do on a million triangles, and more little (tools.bench_accel)
 
 
 def _layer(pairs) -> str:
