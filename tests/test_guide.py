@@ -178,7 +178,7 @@ def test_bytes_per_path_are_what_is_allocated(guide, nee):
     """The state of the guide itself included."""
     r = Renderer(load("coloured-glass", f"integrator.nee={nee}"), threads=1, guide=guide())
     w = r.workers[0]
-    structs = [w.paths, w.triangle_hits, w.surfaces, w.shadow_rays, w.proposals, w.light_proposals, w.scratch]
+    structs = [w.paths, w.ray_hits, w.surfaces, w.shadow_rays, w.proposals, w.light_proposals, w.scratch]
     arrays = [getattr(struct, name) for struct in structs for name in struct._cls.vars]
     arrays += [queue.slots for queue in w.queues.queues.values()]
     arrays += [array for array in vars(w.state).values() if isinstance(array, wp.array)]

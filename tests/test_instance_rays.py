@@ -15,10 +15,11 @@ from tests.test_surface import (
     shapes,
     unit,
 )
-from wavefront.accel.bvh import BoxBvh
+from wavefront.accel.bvh import BoxBvh, TriangleBvh, place
 from wavefront.accel.geometry import Geometry, InstanceHit
-from wavefront.accel.instance import Group, Instance
+from wavefront.accel.instance import Group, Instance, no_shapes
 from wavefront.accel.intersector import make_intersector
+from wavefront.accel.spheres import sphere_boxes
 from wavefront.surface import Vertex, make_vertex, spawn_origin
 
 N = 40_000
@@ -83,20 +84,25 @@ class World(Soup):
         g.spheres = wp.array(self.spheres, dtype=wp.vec4, device=DEVICE)
         identity = np.tile(np.eye(3, dtype=np.float32), (len(self.spheres), 1, 1))
         g.sphere_to_local = wp.array(identity, dtype=wp.mat33, device=DEVICE)
-        group = Group()
+        hierarchies = [(TriangleBvh(g.points, g.indices, alone=False), g.points)]
         if len(self.spheres):
-            grown = 1.0001 * self.spheres[:, 3:] + 1e-5 * np.abs(self.spheres[:, :3]).max(axis=1, keepdims=True)
-            corners = (self.spheres[:, :3] + sign * grown for sign in (-1.0, 1.0))
-            self.balls = wp.Bvh(*(wp.array(c, dtype=wp.vec3, device=DEVICE) for c in corners))
-            group.sphere_bvh = self.balls.id
+            boxes = [wp.array(c, dtype=wp.vec3, device=DEVICE) for c in sphere_boxes(self.spheres)]
+            hierarchies.append((BoxBvh(*boxes, alone=False), *boxes))
+        huge = np.full((len(matrices), 3), 1e30)
+        boxes = [wp.array(c, dtype=wp.vec3, device=DEVICE) for c in (-huge, huge)]
+        hierarchies.append((BoxBvh(*boxes, alone=False), *boxes))
+        g.bvh = place(hierarchies)
+        g.instance_root = hierarchies[-1][0].first_node
+        group = no_shapes()
+        group.root = 0
+        if len(self.spheres):
+            group.sphere_root = hierarchies[1][0].first_node
         g.groups = wp.array([group], dtype=Group, device=DEVICE)
         host = np.zeros(len(matrices), Instance.numpy_dtype())
         host["to_world"], host["translation"] = matrices, translations
         host["to_local"] = np.linalg.inv(host["to_world"].astype(np.float64))
         g.instances = wp.array(host, dtype=Instance, device=DEVICE)
         self.matrices, self.translations = (host[name].astype(np.float64) for name in ("to_world", "translation"))
-        huge = wp.array(np.full((len(matrices), 3), 1e30), dtype=wp.vec3, device=DEVICE)
-        g.instance_bvh = BoxBvh(wp.array(-huge.numpy(), dtype=wp.vec3, device=DEVICE), huge).bvh
 
     def launch(self, kernel, inputs, outputs):
         n = len(inputs[-1])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from wavefront.accel.bvh import TriangleBvh
+from wavefront.accel.bvh import BoxBvh, TriangleBvh
 from wavefront.accel.geometry import Geometry, Hit, Shape
 from wavefront.accel.intersector import make_intersector
 from wavefront.surface import Vertex, make_vertex, spawn_origin
@@ -175,8 +175,7 @@ class OneSphere:
         g.shapes = shapes(1, flip=flip)
         grown = self.radius * 1.001 + 1e-5 * np.abs(self.center).max()
         low, high = (wp.array([self.center + s * grown], dtype=wp.vec3, device=DEVICE) for s in (-1.0, 1.0))
-        self.bvh = wp.Bvh(low, high)
-        g.sphere_bvh = self.bvh.id
+        g.bvh = BoxBvh(low, high).bvh
 
     def trace(self, origin, direction, leaving):
         n = len(origin)

@@ -18,14 +18,19 @@ import numpy as np
 import warp as wp
 
 from tools.peers import mitsuba as peer
-from wavefront.accel import stream, traverse
-from wavefront.accel.bvh import Bvh, TriangleBvh
+from wavefront.accel.bvh import TriangleBvh
+from wavefront.accel.geometry import Geometry, RayHits
+from wavefront.accel.intersector import make_intersector
+from wavefront.accel.stream import make_streams
 from wavefront.errors import WavefrontError
 
 LEAF_SIZES = (1, 2, 4, 8)  # of wp.Mesh
 ENGINES = ("stream", "portable", "wp.Mesh", "embree", "mitsuba")
 CHUNK = 1 << 14  # rays of a launch on the CPU device, at most
 VARIANT = "llvm_ad_rgb"
+
+closest_hit, occluded = make_intersector(True, False)
+streams = make_streams(True, False)
 
 
 @dataclasses.dataclass
@@ -123,7 +128,7 @@ def mesh_any(
 
 @wp.kernel(enable_backward=False, module="unique")
 def portable_closest(
-    bvh: Bvh,
+    geometry: Geometry,
     origin: wp.array[wp.vec3],
     direction: wp.array[wp.vec3],
     # out
@@ -132,7 +137,7 @@ def portable_closest(
     uv: wp.array[wp.vec2],
 ):
     i = wp.tid()
-    hit = traverse.trace_triangles(bvh, 0, origin[i], direction[i], 3.0e38, False)
+    hit = closest_hit(geometry, origin[i], direction[i])
     primitive[i] = hit.primitive
     t[i] = hit.t
     uv[i] = wp.vec2(hit.u, hit.v)
@@ -140,7 +145,7 @@ def portable_closest(
 
 @wp.kernel(enable_backward=False, module="unique")
 def portable_any(
-    bvh: Bvh,
+    geometry: Geometry,
     origin: wp.array[wp.vec3],
     direction: wp.array[wp.vec3],
     t_max: wp.array[float],
@@ -148,8 +153,7 @@ def portable_any(
     blocked: wp.array[wp.int32],
 ):
     i = wp.tid()
-    hit = traverse.trace_triangles(bvh, 0, origin[i], direction[i], t_max[i], True)
-    blocked[i] = wp.where(hit.primitive >= 0, 1, 0)
+    blocked[i] = wp.where(occluded(geometry, origin[i], direction[i], t_max[i]), 1, 0)
 
 
 @functools.cache
@@ -159,7 +163,7 @@ def make_stream(any_hit: bool):
 
         @wp.kernel(enable_backward=False, module="unique")
         def stream_any(
-            bvh: Bvh,
+            geometry: Geometry,
             slots: wp.array[wp.int32],
             origin: wp.array[wp.vec3],
             direction: wp.array[wp.vec3],
@@ -167,13 +171,13 @@ def make_stream(any_hit: bool):
             # out
             blocked: wp.array[wp.int32],
         ):
-            stream.any_triangles(bvh, 0, slots, slots.shape[0], origin, direction, t_max, blocked)
+            streams.occluded(geometry, slots, slots.shape[0], origin, direction, t_max, blocked)
 
         return stream_any
 
     @wp.kernel(enable_backward=False, module="unique")
     def stream_closest(
-        bvh: Bvh,
+        geometry: Geometry,
         slots: wp.array[wp.int32],
         origin: wp.array[wp.vec3],
         direction: wp.array[wp.vec3],
@@ -182,7 +186,11 @@ def make_stream(any_hit: bool):
         t: wp.array[float],
         uv: wp.array[wp.vec2],
     ):
-        stream.closest_triangles(bvh, 0, slots, slots.shape[0], origin, direction, primitive, t, uv)
+        hits = RayHits()
+        hits.primitive = primitive
+        hits.t = t
+        hits.uv = uv
+        streams.closest(geometry, slots, slots.shape[0], origin, direction, hits)
 
     return stream_closest
 
@@ -264,9 +272,11 @@ class Ours(OnWarp):
 
     def build(self) -> None:
         self.hierarchy = TriangleBvh(self.points, self.indices)
+        self.geometry = Geometry()  # its root is node 0
+        self.geometry.bvh = self.hierarchy.bvh
 
     def release(self) -> None:
-        self.hierarchy = None
+        self.hierarchy = self.geometry = None
 
     def statistics(self) -> dict:
         return dataclasses.asdict(self.hierarchy.statistics())
@@ -274,7 +284,7 @@ class Ours(OnWarp):
     def query(self, engine: str, rays: Rays, any_hit: bool) -> WarpQuery:
         queue = engine == "stream"
         kernel = make_stream(any_hit) if queue else (portable_any if any_hit else portable_closest)
-        return WarpQuery(kernel, self.hierarchy.bvh, queue, rays, any_hit, self.device, self.threads)
+        return WarpQuery(kernel, self.geometry, queue, rays, any_hit, self.device, self.threads)
 
 
 class WarpMesh(OnWarp):

@@ -17,13 +17,14 @@ import numpy as np
 import warp as wp
 
 from wavefront import queues
+from wavefront.accel.geometry import RayHits
 from wavefront.camera import camera_kind, make_camera
 from wavefront.errors import WavefrontError
 from wavefront.features import Features
 from wavefront.film import FIRST_HIT, Film, film_arrays, make_window
 from wavefront.guide import Guide
 from wavefront.proposals import INPUTS, LightProposals, Proposals
-from wavefront.queues import Paths, QueueSet, ShadowRays, Surfaces, TriangleHits, allocate_struct, bytes_per_slot
+from wavefront.queues import Paths, QueueSet, ShadowRays, Surfaces, allocate_struct, bytes_per_slot
 from wavefront.recording import RecordScratch, scratch_arrays
 from wavefront.scene import description
 from wavefront.scene.device import DeviceScene
@@ -38,7 +39,7 @@ from wavefront.stages.intersect import make_intersect
 from wavefront.stages.perturb import make_perturb
 from wavefront.stages.scatter import make_scatter
 from wavefront.stages.shadow import make_shadow
-from wavefront.stages.stream import stream_rays, stream_shadow_rays
+from wavefront.stages.stream import make_stream, make_stream_shadow
 
 FILTER_SCALES = {"box": lambda f: 0.5, "tent": lambda f: f.radius, "gaussian": lambda f: f.stddev}
 
@@ -49,13 +50,13 @@ def filter_kind(film: description.Film) -> str:
 
 def make_features(scene: description.Scene, device_scene: DeviceScene, guide: Guide | None = None) -> Features:
     """What the kernels for a scene, its settings and a guide must do, and no more."""
-    integrator = scene.integrator
+    integrator, own = scene.integrator, device_scene.geometry.own
     return Features(
-        triangles=device_scene.geometry.root >= 0,
-        spheres=bool(device_scene.geometry.sphere_bvh),
+        triangles=own.root >= 0,
+        spheres=own.sphere_root >= 0,
         instances=device_scene.instances,
         accel=device_scene.accel,
-        streams=device_scene.streams and device_scene.geometry.root >= 0,
+        streams=device_scene.streams,
         smooth=device_scene.smooth,
         uvs=bool(device_scene.texture_kinds) or "uv" in scene.film.aovs,
         tangents=device_scene.tangents,
@@ -109,7 +110,7 @@ def make_kernels(f: Features) -> Kernels:
     """Kernels for a set of features; scenes that agree in what a stage reads share its kernel."""
     return Kernels(
         generate=make_generate(f.camera, f.filter, f.transmission, f.sampler),
-        stream=stream_rays if f.streams else None,
+        stream=make_stream(f.triangles, f.spheres, f.instances) if f.streams else None,
         intersect=make_intersect(
             f.triangles,
             f.spheres,
@@ -134,7 +135,9 @@ def make_kernels(f: Features) -> Kernels:
         )
         if f.light_sampling and not f.guided
         else None,
-        stream_shadow=stream_shadow_rays if f.streams and f.light_sampling else None,
+        stream_shadow=make_stream_shadow(f.triangles, f.spheres, f.instances)
+        if f.streams and f.light_sampling
+        else None,
         shadow=make_shadow(f.triangles, f.spheres, f.instances, f.accel, f.streams) if f.light_sampling else None,
         drain=drain_rays,
         scatter=make_scatter(
@@ -162,7 +165,7 @@ def skipped_arrays(f: Features) -> dict[type, tuple[str, ...]]:
     return {
         Paths: (() if f.transmission else ("eta",)) + (() if f.media else ("medium",)),
         Surfaces: tuple(name for name, used in surface_arrays.items() if not used),
-        TriangleHits: () if f.streams else tuple(TriangleHits.vars),
+        RayHits: (() if f.instances else ("instance",)) if f.streams else tuple(RayHits.vars),
         ShadowRays: (() if f.streams else ("blocked",)) if f.light_sampling else tuple(ShadowRays.vars),
     }
 
@@ -238,12 +241,11 @@ class Worker:
         self.queues = QueueSet(capacity, device, queue_names(features))
         self.tile = wp.zeros(queues.TILE_FIELDS, dtype=wp.int32, device=device)
         skip = skipped_arrays(features)
-        paths, triangle_hits, surfaces, shadow_rays = (
-            allocate_struct(struct, capacity, device, skip[struct])
-            for struct in (Paths, TriangleHits, Surfaces, ShadowRays)
+        paths, ray_hits, surfaces, shadow_rays = (
+            allocate_struct(struct, capacity, device, skip[struct]) for struct in (Paths, RayHits, Surfaces, ShadowRays)
         )
         self.paths, self.surfaces, self.shadow_rays = paths, surfaces, shadow_rays
-        self.triangle_hits = triangle_hits
+        self.ray_hits = ray_hits
         geometry, materials = device_scene.geometry, device_scene.materials
         textures, lights = device_scene.textures, device_scene.lights
         rays, hits, escaped, emissive, shadow = (
@@ -259,8 +261,8 @@ class Worker:
         # In the order of the kernels' parameters.
         arguments = {
             "generate": [camera, tile, window, scale, seed, paths, rays, counters, totals],
-            "stream": [geometry, paths, rays, triangle_hits],
-            "intersect": [geometry, paths, rays, triangle_hits, max_depth, surfaces, hits, escaped, emissive, counters],
+            "stream": [geometry, paths, rays, ray_hits],
+            "intersect": [geometry, paths, rays, ray_hits, max_depth, surfaces, hits, escaped, emissive, counters],
             "perturb": [materials, textures, paths, rays, surfaces],
             "escaped": [lights, paths, escaped, counters],
             "emission": [geometry, lights, textures, paths, surfaces, emissive, counters],

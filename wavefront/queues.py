@@ -107,15 +107,6 @@ class Surfaces:
 
 
 @wp.struct
-class TriangleHits:
-    """First of the scene's own triangles that a ray meets, one entry per slot; allocated if rays go in streams."""
-
-    primitive: wp.array[wp.int32]  # -1: none
-    t: wp.array[wp.float32]
-    uv: wp.array[wp.vec2]  # weights of the first and second vertex
-
-
-@wp.struct
 class ShadowRays:
     """Light samples that wait for their visibility, one entry per slot."""
 
@@ -123,7 +114,7 @@ class ShadowRays:
     direction: wp.array[wp.vec3]  # scaled so that the light is at parameter t_max
     t_max: wp.array[wp.float32]
     L: wp.array[wp.vec3]  # what arrives at the camera if nothing is in between
-    blocked: wp.array[wp.int32]  # 1 if one of the scene's own triangles is in between; allocated if rays go in streams
+    blocked: wp.array[wp.int32]  # 1 if something is in between; allocated if rays go in streams
 
 
 def allocate_struct(struct: type, capacity: int, device: str, skip: tuple[str, ...] = ()):

@@ -13,7 +13,7 @@ from tests.accel.tracing import DEVICE, check_any, portable_kernel, soup_bvh, tr
 from tests.test_cuda_compile import built, compile_modules
 from wavefront.accel import bvh as bvh_module
 from wavefront.accel import collapse, ploc
-from wavefront.accel.bvh import BoxBvh, TriangleBvh, place_triangles
+from wavefront.accel.bvh import BoxBvh, TriangleBvh, place
 
 EMPTY = -(2**31)
 NODE_COST, BLOCK_COST = 1.0, 0.8
@@ -34,7 +34,7 @@ class Walk:
 def walk(bvh, root: int, block: int, max_blocks: int) -> Walk:
     """Follows the links, and nothing else, from the root to the leaves."""
     tables = bvh.nodes.numpy().reshape(-1, 24)
-    vectors = bvh.blocks.numpy().reshape(-1, 40 if block == 4 else 4)
+    vectors = bvh.blocks.numpy().reshape(-1, 40)
     out = Walk([], [], [], 0)
 
     def below(node, level):
@@ -56,17 +56,14 @@ def walk(bvh, root: int, block: int, max_blocks: int) -> Walk:
             else:
                 first, blocks = divmod(-1 - link, max_blocks)
                 blocks += 1
-                numbers = vectors[first : first + blocks, -4:].view(np.int32)
-                if block == 1:
-                    assert (numbers == numbers[:, :1]).all()
-                    numbers = numbers[:, :1]
-                members = numbers.ravel().tolist()
-                count = len([m for m in members if m >= 0])
-                assert 0 < count <= block * blocks and count > block * (blocks - 1)
+                members = [first]
                 if block == 4:
+                    members = vectors[first : first + blocks, -4:].view(np.int32).ravel().tolist()
                     empty = np.array(members).reshape(-1, 4) < 0
                     places = np.isnan(vectors[first : first + blocks, :36].reshape(-1, 9, 4))
                     assert (places == empty[:, None]).all()
+                count = len([m for m in members if m >= 0])
+                assert 0 < count <= block * blocks and count > block * (blocks - 1)
                 members = [m for m in members if m >= 0]
                 out.leaves.append(members)
             out.boxes.append((corners[:, :, k].copy(), widths, members, link < 0, blocks))
@@ -105,8 +102,10 @@ def check_tree(hierarchy, lower, upper, first: int = 0, block: int = 4, max_bloc
     assert statistics.leaves == leaf.sum() == len(found.leaves)
     assert statistics.levels == found.levels <= bvh_module.MAX_LEVELS
     assert hierarchy.block_count == blocks.sum()
-    traced = 96 * len(found.nodes) + (160 if block == 4 else 16) * blocks.sum()
-    refitted = 32 * len(found.nodes) + 8 * blocks.sum() + 4 * len(lower)
+    traced, refitted = 96 * len(found.nodes), 32 * len(found.nodes)
+    if block == 4:
+        traced += 160 * blocks.sum()
+        refitted += 8 * blocks.sum() + 4 * len(lower)
     assert statistics.bytes == traced + refitted
     assert statistics.seconds > 0.0
     areas = np.array([half_area(*b[0]) for b in found.boxes]) / half_area(*found.nodes[-1][3])
@@ -311,10 +310,10 @@ def test_hierarchies_in_common_tables_stay_apart():
     points = vectors(np.concatenate(soups))
     corner_numbers = np.arange(3 * starts[-1], dtype=np.int32)
     hierarchies = [
-        TriangleBvh(points, wp.array(corner_numbers[3 * i : 3 * j], device=DEVICE), first)
+        TriangleBvh(points, wp.array(corner_numbers[3 * i : 3 * j], device=DEVICE), first, alone=False)
         for (i, j), first in zip(itertools.pairwise(starts), firsts, strict=True)
     ]
-    bvh = place_triangles(hierarchies, points)
+    bvh = place([(h, points) for h in hierarchies])
     assert [h.first_node for h in hierarchies] == [0, *np.cumsum([h.node_count for h in hierarchies])[:-1]]
 
     def check_all():

@@ -21,6 +21,7 @@ from tests.accel.tracing import (
     stream_kernel,
     trace,
     trace_both,
+    triangles_below,
     vectors,
 )
 
@@ -155,7 +156,7 @@ def test_a_stream_of_any_length_leaves_other_slots_alone():
         slots = wp.array(2 * np.arange(count, dtype=np.int32), dtype=wp.int32, device=DEVICE)
         out = [wp.full(2 * count + 2, -7, dtype=t, device=DEVICE) for t in (wp.int32, wp.float32, wp.vec2, wp.int32)]
         bounds = wp.full(2 * count + 2, FAR, dtype=wp.float32, device=DEVICE)
-        inputs = [bvh, 0, slots, vectors(origin), vectors(direction), bounds]
+        inputs = [triangles_below(bvh, 0), slots, vectors(origin), vectors(direction), bounds]
         wp.launch(stream_kernel, dim=1, inputs=inputs, outputs=out, device=DEVICE)
         primitive, blocked = out[0].numpy(), out[3].numpy()
         assert (primitive[: 2 * count : 2] == expected.primitive[: 2 * count : 2]).all()

@@ -7,18 +7,21 @@ import dataclasses
 import numpy as np
 import warp as wp
 
-from wavefront.accel import stream
 from wavefront.accel.bvh import Bvh, TriangleBvh
-from wavefront.accel.traverse import trace_triangles
+from wavefront.accel.geometry import Geometry, RayHits
+from wavefront.accel.intersector import make_intersector
+from wavefront.accel.stream import make_streams
 
 DEVICE = "cpu"
-FAR = 3.0e38  # what bounds the closest hit of a stream
+FAR = 3.0e38  # what bounds the closest hit
+
+closest_hit, occluded = make_intersector(True, False)
+closest_stream, occluded_stream = make_streams(True, False)
 
 
 @wp.kernel(enable_backward=False, module="unique")
 def portable_kernel(
-    bvh: Bvh,
-    root: int,
+    geometry: Geometry,
     origin: wp.array[wp.vec3],
     direction: wp.array[wp.vec3],
     t_max: wp.array[wp.float32],
@@ -29,18 +32,16 @@ def portable_kernel(
     blocked: wp.array[wp.int32],
 ):
     i = wp.tid()
-    hit = trace_triangles(bvh, root, origin[i], direction[i], FAR, False)
+    hit = closest_hit(geometry, origin[i], direction[i])
     primitive[i] = hit.primitive
     t[i] = hit.t
     uv[i] = wp.vec2(hit.u, hit.v)
-    hit = trace_triangles(bvh, root, origin[i], direction[i], t_max[i], True)
-    blocked[i] = wp.where(hit.primitive >= 0, 1, 0)
+    blocked[i] = wp.where(occluded(geometry, origin[i], direction[i], t_max[i]), 1, 0)
 
 
 @wp.kernel(enable_backward=False, module="unique")
 def stream_kernel(
-    bvh: Bvh,
-    root: int,
+    geometry: Geometry,
     slots: wp.array[wp.int32],
     origin: wp.array[wp.vec3],
     direction: wp.array[wp.vec3],
@@ -51,8 +52,12 @@ def stream_kernel(
     uv: wp.array[wp.vec2],
     blocked: wp.array[wp.int32],
 ):
-    stream.closest_triangles(bvh, root, slots, slots.shape[0], origin, direction, primitive, t, uv)
-    stream.any_triangles(bvh, root, slots, slots.shape[0], origin, direction, t_max, blocked)
+    hits = RayHits()
+    hits.primitive = primitive
+    hits.t = t
+    hits.uv = uv
+    closest_stream(geometry, slots, slots.shape[0], origin, direction, hits)
+    occluded_stream(geometry, slots, slots.shape[0], origin, direction, t_max, blocked)
 
 
 @dataclasses.dataclass
@@ -76,6 +81,13 @@ def soup_bvh(corners, first_triangle: int = 0) -> TriangleBvh:
     return TriangleBvh(vectors(corners), indices, first_triangle)
 
 
+def triangles_below(bvh: Bvh, root: int) -> Geometry:
+    """A scene of the triangles of one hierarchy."""
+    geometry = Geometry()
+    geometry.bvh, geometry.own.root = bvh, root
+    return geometry
+
+
 def trace(kernel, bvh: Bvh, root: int, origin, direction, t_max=None) -> Hits:
     """What one of both kernels finds; the stream takes its rays in a mixed order."""
     n = len(origin)
@@ -85,7 +97,7 @@ def trace(kernel, bvh: Bvh, root: int, origin, direction, t_max=None) -> Hits:
         queue = [wp.array(np.random.default_rng(1).permutation(n).astype(np.int32), device=DEVICE)]
         dim = 1
     out = [wp.zeros(n, dtype=t, device=DEVICE) for t in (wp.int32, wp.float32, wp.vec2, wp.int32)]
-    inputs = [bvh, root, *queue, vectors(origin), vectors(direction), t_max]
+    inputs = [triangles_below(bvh, root), *queue, vectors(origin), vectors(direction), t_max]
     wp.launch(kernel, dim=dim, inputs=inputs, outputs=out, device=DEVICE)
     return Hits(*(a.numpy() for a in out))
 

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from wavefront import queues
-from wavefront.accel.bvh import TriangleBvh
+from wavefront.accel.bvh import BoxBvh, TriangleBvh, place
 from wavefront.accel.geometry import Geometry, Shape
 from wavefront.bsdf import tables as bsdf
 from wavefront.light import tables as light
@@ -114,12 +114,16 @@ class Scene:
         g.shape_of = array(np.arange(total, dtype=np.int32), wp.int32)
         defaults = [{"first_light": -1, "first_primitive": i} for i in range(total)]
         g.shapes = records(Shape, [a | b for a, b in zip(defaults, shapes or [{}] * total, strict=True)])
+        hierarchies = []
         if count:
-            g.bvh = TriangleBvh(g.points, g.indices).bvh
+            hierarchies.append((TriangleBvh(g.points, g.indices, alone=False), g.points))
         if len(spheres):
             s = np.asarray(spheres, np.float32)
-            self.bvh = wp.Bvh(array(s[:, :3] - 1.001 * s[:, 3:], wp.vec3), array(s[:, :3] + 1.001 * s[:, 3:], wp.vec3))
-            g.sphere_bvh = self.bvh.id
+            boxes = [array(s[:, :3] + grown * s[:, 3:], wp.vec3) for grown in (-1.001, 1.001)]
+            hierarchies.append((BoxBvh(*boxes, alone=False), *boxes))
+        if hierarchies:
+            g.bvh = place(hierarchies)
+            g.own.sphere_root = hierarchies[-1][0].first_node
 
 
 def lights(rows: list[dict], radiances, environment: int = -1) -> light.LightTables:

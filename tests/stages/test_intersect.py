@@ -6,7 +6,7 @@ import warp as wp
 
 from tests.stages.harness import Counters, Scene, array, launch, paths, surfaces, unit
 from wavefront import queues
-from wavefront.queues import TriangleHits
+from wavefront.accel.geometry import RayHits
 from wavefront.stages.intersect import make_intersect
 
 FAR = -5.0
@@ -60,7 +60,7 @@ def trace(
     s = surfaces(n, material=99, light=99)
     rays = counters.queue("rays", range(n) if slots is None else slots)
     out = [counters.queue(name, capacity=capacity) for name in ("hits", "escaped", "emissive")]
-    inputs = [scene.geometry, p, rays, TriangleHits(), max_depth, s, *out, counters.array]
+    inputs = [scene.geometry, p, rays, RayHits(), max_depth, s, *out, counters.array]
     launch(make_intersect(True, True, **features), 16, *inputs)
     return s, counters
 

@@ -6,7 +6,7 @@ each: the lower x of all eight, then y and z, then the upper ones. float32 holds
 a corner is the same however it is computed; boxes are rounded outwards by at most a cell. A leaf is one or two blocks
 of four triangles: the x of their first vertices, then y and z, then those of the second and third vertices, then the
 indices of the triangles; places without a triangle hold NaN. So that eight boxes or four triangles are tested at once,
-each with one vector instruction a coordinate.
+each with one vector instruction a coordinate. In a hierarchy of boxes a leaf is a box, and its link the box's number.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Bvh:
     nodes: wp.array[wp.vec4]
     links: wp.array[wp.vec4i]  # the same memory
     blocks: wp.array[wp.vec4]
-    primitives: wp.array[wp.vec4i]  # the same memory; of a hierarchy of boxes: one vector a box, its index four times
+    primitives: wp.array[wp.vec4i]  # the same memory
 
 
 @wp.kernel
@@ -104,21 +104,17 @@ def write_blocks(
 
 
 @wp.kernel
-def write_boxes(
-    box_lower: wp.array[wp.vec3],
-    box_upper: wp.array[wp.vec3],
+def name_boxes(
     order: wp.array[wp.int32],
     block_ranges: wp.array[wp.vec2i],
-    # out
-    bvh: Bvh,
-    lower: wp.array[wp.vec3],
-    upper: wp.array[wp.vec3],
+    # also out
+    links: wp.array[Children],
 ):
+    """From the links of blocks of one box to those of the boxes themselves."""
     i = wp.tid()
-    index = order[block_ranges[i][0]]
-    bvh.primitives[i] = wp.vec4i(index)
-    lower[i] = box_lower[index]
-    upper[i] = box_upper[index]
+    for k in range(WIDTH):
+        if links[i][k] < 0 and links[i][k] != EMPTY:
+            links[i][k] = ~order[block_ranges[~links[i][k]][0]]
 
 
 @wp.kernel
@@ -270,6 +266,7 @@ class _Hierarchy:
 
     def __init__(self, wide: WideTree, max_blocks: int, device):
         self.wide, self.max_blocks, self.device = wide, max_blocks, device
+        self.primitive_count, self.block_count = wide.order.shape[0], wide.block_ranges.shape[0]
         self.first_node = self.first_block = 0
         self.bvh: Bvh | None = None
         self.build_seconds = 0.0
@@ -278,24 +275,16 @@ class _Hierarchy:
     def node_count(self) -> int:
         return self.wide.levels[-1]
 
-    @property
-    def block_count(self) -> int:
-        return self.wide.block_ranges.shape[0]
-
     def _place(self, bvh: Bvh, first_node: int, first_block: int) -> None:
-        """Takes its place in tables that other hierarchies may share."""
         self.bvh, self.first_node, self.first_block = bvh, first_node, first_block
         inputs = [self.wide.links, first_node, first_block * self.max_blocks, bvh]
         wp.launch(write_links, self.node_count, inputs=inputs, device=self.device)
 
-    def _fit(self, write, inputs: list) -> None:
-        blocks, nodes = (
-            [wp.empty(count, dtype=wp.vec3, device=self.device) for _ in range(2)]
-            for count in (self.block_count, self.node_count)
-        )
-        wp.launch(write, self.block_count, inputs=inputs, outputs=[self.bvh, *blocks], device=self.device)
+    def _fit(self, lower: wp.array, upper: wp.array) -> None:
+        """Fits nodes to the boxes of blocks."""
+        boxes = [wp.empty(self.node_count, dtype=wp.vec3, device=self.device) for _ in range(2)]
         for first, end in reversed(list(itertools.pairwise(self.wide.levels))):
-            inputs = [self.bvh, *blocks, self.max_blocks, self.first_block, self.first_node, first, *nodes]
+            inputs = [self.bvh, lower, upper, self.max_blocks, self.first_block, self.first_node, first, *boxes]
             wp.launch(fit_nodes, end - first, inputs=inputs, device=self.device)
 
     def statistics(self) -> Statistics:
@@ -318,7 +307,7 @@ class _Hierarchy:
         block_visits = float((areas * blocks).sum() / root)
         vectors = self.node_count * NODE_VECTORS + self.block_count * self._block_vectors
         return Statistics(
-            primitives=self.wide.order.shape[0],
+            primitives=self.primitive_count,
             nodes=self.node_count,
             leaves=int(leaves.sum()),
             levels=len(self.wide.levels) - 1,
@@ -337,18 +326,20 @@ class TriangleBvh(_Hierarchy):
         points: Vertices, [N] vec3, metres.
         indices: Three a triangle, [3 M] int32, M >= 1.
         first_triangle: Number of the first triangle in hits.
+        alone: Whether it has tables of its own; if not, `place` puts it where it can be traced.
     """
 
     _block_vectors = BLOCK_VECTORS
 
-    def __init__(self, points: wp.array, indices: wp.array, first_triangle: int = 0):
+    def __init__(self, points: wp.array, indices: wp.array, first_triangle: int = 0, alone: bool = True):
         begin = time.perf_counter()
         count, device = indices.shape[0] // 3, points.device
         lower, upper = (wp.empty(count, dtype=wp.vec3, device=device) for _ in range(2))
         wp.launch(triangle_bounds, count, inputs=[points, indices], outputs=[lower, upper], device=device)
         super().__init__(_topology(lower, upper, BLOCK, MAX_BLOCKS), MAX_BLOCKS, device)
         self.indices, self.first_triangle = indices, first_triangle
-        place_triangles([self], points)
+        if alone:
+            place([(self, points)])
         wp.synchronize_device(device)
         self.build_seconds = time.perf_counter() - begin
 
@@ -358,54 +349,65 @@ class TriangleBvh(_Hierarchy):
         Args:
             points: As many as before, in the same order.
         """
+        boxes = [wp.empty(self.block_count, dtype=wp.vec3, device=self.device) for _ in range(2)]
         inputs = [points, self.indices, self.wide.order, self.wide.block_ranges, self.first_triangle, self.first_block]
-        self._fit(write_blocks, inputs)
-
-
-def _tables(nodes: int, block_vectors: int, device) -> Bvh:
-    bvh = Bvh()
-    bvh.nodes = wp.empty(NODE_VECTORS * nodes, dtype=wp.vec4, device=device)
-    bvh.blocks = wp.empty(block_vectors, dtype=wp.vec4, device=device)
-    bvh.links, bvh.primitives = bvh.nodes.view(wp.vec4i), bvh.blocks.view(wp.vec4i)
-    return bvh
-
-
-def place_triangles(hierarchies: list[TriangleBvh], points: wp.array) -> Bvh:
-    """Puts hierarchies over triangles of the same vertices into common tables, which they share from then on.
-
-    The root of each is its `first_node`.
-    """
-    if len(hierarchies) == 1 and hierarchies[0].bvh is not None:
-        return hierarchies[0].bvh
-    nodes, blocks = (sum(getattr(h, name) for h in hierarchies) for name in ("node_count", "block_count"))
-    bvh = _tables(nodes, BLOCK_VECTORS * blocks, points.device)
-    first_node = first_block = 0
-    for hierarchy in hierarchies:
-        hierarchy._place(bvh, first_node, first_block)
-        hierarchy.refit(points)
-        first_node += hierarchy.node_count
-        first_block += hierarchy.block_count
-    return bvh
+        wp.launch(write_blocks, self.block_count, inputs=inputs, outputs=[self.bvh, *boxes], device=self.device)
+        self._fit(*boxes)
 
 
 class BoxBvh(_Hierarchy):
-    """A hierarchy over boxes, such as those of instances, with one box a leaf.
+    """A hierarchy over boxes, such as those of spheres and of instances, with one box a leaf.
 
     Args:
         lower, upper: Corners, [N] vec3, N >= 1.
+        first_box: Number of the first box in links.
+        alone: As of `TriangleBvh`.
     """
 
-    _block_vectors = 1
+    _block_vectors = 0
 
-    def __init__(self, lower: wp.array, upper: wp.array):
+    def __init__(self, lower: wp.array, upper: wp.array, first_box: int = 0, alone: bool = True):
         begin = time.perf_counter()
         device = lower.device
         super().__init__(_topology(lower, upper, 1, 1), 1, device)
-        self._place(_tables(self.node_count, self.block_count, device), 0, 0)
-        self.refit(lower, upper)
+        wide, none = self.wide, wp.empty(0, dtype=wp.int32, device=device)
+        wp.launch(
+            name_boxes, self.node_count, inputs=[wide.order, wide.block_ranges], outputs=[wide.links], device=device
+        )
+        self.wide = dataclasses.replace(wide, block_ranges=none, order=none)
+        self.first_box = first_box
+        if alone:
+            place([(self, lower, upper)])
         wp.synchronize_device(device)
         self.build_seconds = time.perf_counter() - begin
 
+    def _place(self, bvh: Bvh, first_node: int, first_block: int) -> None:
+        super()._place(bvh, first_node, self.first_box)
+
     def refit(self, lower: wp.array, upper: wp.array) -> None:
         """Moves the boxes; which are together stays."""
-        self._fit(write_boxes, [lower, upper, self.wide.order, self.wide.block_ranges])
+        self._fit(lower, upper)
+
+
+def place(hierarchies: list[tuple]) -> Bvh:
+    """Puts hierarchies into common tables, which they share from then on, and fits them.
+
+    The root of each is its `first_node`.
+
+    Args:
+        hierarchies: Each with the arguments of its `refit`; at least one.
+    """
+    device = hierarchies[0][0].device
+    nodes = sum(h.node_count for h, *_ in hierarchies)
+    vectors = sum(h.block_count * h._block_vectors for h, *_ in hierarchies)
+    bvh = Bvh()
+    bvh.nodes = wp.empty(NODE_VECTORS * nodes, dtype=wp.vec4, device=device)
+    bvh.blocks = wp.empty(vectors, dtype=wp.vec4, device=device)
+    bvh.links, bvh.primitives = bvh.nodes.view(wp.vec4i), bvh.blocks.view(wp.vec4i)
+    first_node = first_vector = 0
+    for hierarchy, *arrays in hierarchies:
+        hierarchy._place(bvh, first_node, first_vector // BLOCK_VECTORS)
+        hierarchy.refit(*arrays)
+        first_node += hierarchy.node_count
+        first_vector += hierarchy.block_count * hierarchy._block_vectors
+    return bvh

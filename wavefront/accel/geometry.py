@@ -30,10 +30,8 @@ class Shape:
 
 @wp.struct
 class Geometry:
-    bvh: Bvh  # of triangles
-    root: wp.int32  # of the scene's own triangles
-    mesh: wp.uint64  # the same for `wp.Mesh` queries; 0 unless they were chosen
-    sphere_bvh: wp.uint64
+    bvh: Bvh  # all hierarchies
+    own: Group  # the scene itself
     triangle_count: wp.int32
     points: wp.array[wp.vec3]
     indices: wp.array[wp.int32]
@@ -43,7 +41,7 @@ class Geometry:
     sphere_to_local: wp.array[wp.mat33]  # world normals to the sphere's own axes; empty as `uvs`
     shape_of: wp.array[wp.int32]  # shape of each primitive
     shapes: wp.array[Shape]
-    instance_bvh: Bvh  # of the boxes of instances; its root is node 0
+    instance_root: wp.int32  # of the hierarchy of their boxes
     instances: wp.array[Instance]  # empty if there are none
     groups: wp.array[Group]
     sigma_a: wp.array[wp.vec3]  # of each medium, 1/m; the first is vacuum; empty if none absorbs
@@ -67,6 +65,16 @@ class InstanceHit:
     u: wp.float32
     v: wp.float32
     instance: wp.int32  # -1: the primitive is the scene's own
+
+
+@wp.struct
+class RayHits:
+    """Hits of rays that go in streams, one entry per slot; allocated if there are such."""
+
+    primitive: wp.array[wp.int32]
+    t: wp.array[wp.float32]
+    uv: wp.array[wp.vec2]
+    instance: wp.array[wp.int32]  # allocated if there are instances
 
 
 def hit_type(instances: tuple[str, ...]):

@@ -5,13 +5,18 @@ import warp as wp
 
 @wp.struct
 class Group:
-    """Shapes in a space of their own."""
+    """Shapes in a space of their own, or the scene's in the world."""
 
     root: wp.int32  # of its triangles in `Geometry.bvh`; -1: it has none
-    mesh: wp.uint64  # the same for `wp.Mesh` queries
-    sphere_bvh: wp.uint64  # 0: no spheres
-    first_triangle: wp.int32
-    first_sphere: wp.int32
+    sphere_root: wp.int32  # of its spheres; -1: it has none
+    mesh: wp.uint64  # its triangles for `wp.Mesh` queries; 0 unless they were chosen
+    first_triangle: wp.int32  # of the mesh
+
+
+def no_shapes() -> Group:
+    group = Group()
+    group.root = group.sphere_root = -1
+    return group
 
 
 @wp.struct

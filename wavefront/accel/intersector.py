@@ -1,6 +1,8 @@
 """Intersection of rays with a scene: the one interface that stages see.
 
-With instances there are two levels: a hierarchy of their boxes, and below it the triangles and spheres of a group.
+With instances there are two levels: a hierarchy of their boxes, and below it the triangles and spheres of a group. Of
+equal distances the scene's own primitives come first, then those of the instance of the lowest number, and of these the
+one of the lowest number.
 """
 
 # Annotations are evaluated at once, for the type of a hit depends on whether there are instances.
@@ -9,94 +11,102 @@ from typing import NamedTuple
 
 import warp as wp
 
-from wavefront.accel.bvh import NODE_VECTORS
-from wavefront.accel.collapse import EMPTY, WIDTH
-from wavefront.accel.geometry import INFINITE, Geometry, hit_type
-from wavefront.accel.instance import point_to_local
-from wavefront.accel.spheres import any_sphere, closest_sphere
-from wavefront.accel.traverse import Distances, Links, TriangleHit, box_distances, slopes, trace_triangles
+from wavefront.accel.geometry import INFINITE, Geometry, Hit, InstanceHit, hit_type
+from wavefront.accel.instance import Group, point_to_local
+from wavefront.accel.spheres import trace_spheres
+from wavefront.accel.traverse import Ray, make_ray, make_traversal, trace_triangles
 
-ACCELS = ("bvh", "mesh")  # how they are found: our hierarchy, or queries of `wp.Mesh`
+ACCELS = ("bvh", "mesh")  # how triangles are found: our hierarchy, or queries of `wp.Mesh`
+LARGEST = wp.constant(2147483647)
 
 
 class Intersector(NamedTuple):
-    """Functions that trace rays; `direction` is of unit length for hits, of any length for occlusion.
+    """Functions that trace rays; `direction` is of any length.
 
     Attributes:
         closest_hit: `(geometry, origin, direction) -> hit_type(instances)`.
         occluded: `(geometry, origin, direction, t_max) -> bool`.
-        closest_other: `(geometry, origin, direction, hit)`: the nearer of `hit` and what is met besides the scene's own
-            triangles, which have been traced before.
-        occluded_by_other: As `occluded`, the scene's own triangles apart.
     """
 
     closest_hit: wp.Function
     occluded: wp.Function
-    closest_other: wp.Function
-    occluded_by_other: wp.Function
+
+
+@wp.func
+def query_mesh(group: Group, ray: Ray, nearest: Hit, any_will_do: bool) -> Hit:
+    """`trace_triangles` by `wp.Mesh`, which chooses among equal distances itself."""
+    hit = nearest
+    if any_will_do:
+        if wp.mesh_query_ray_anyhit(group.mesh, ray.origin, ray.direction, hit.t):
+            hit.primitive = group.first_triangle
+    else:
+        query = wp.mesh_query_ray(group.mesh, ray.origin, ray.direction, hit.t)
+        primitive = group.first_triangle + query.face
+        if query.result and (query.t < hit.t or (query.t == hit.t and primitive < hit.primitive)):
+            hit.t = query.t
+            hit.primitive = primitive
+            hit.u = query.u
+            hit.v = query.v
+    return hit
 
 
 @functools.cache
-def make_triangle_queries(accel: str):
-    """Functions of the triangles of a scene or of a group.
+def make_group_tracer(triangles: bool, spheres: bool, accel: str):
+    """`(geometry, group, ray, nearest, any_will_do) -> Hit` in the space of a group: the first of its primitives and of
+    `nearest`; or any, if `nearest` is none.
 
     Args:
+        triangles, spheres: Whether a group may have some.
         accel: One of `ACCELS`.
-
-    Returns:
-        `closest(geometry, mesh, root, first_triangle, origin, direction, t_max) -> TriangleHit` and
-        `any_before(geometry, mesh, root, origin, direction, t_max) -> bool`; of `mesh` and `root` one counts.
     """
-    if accel == "bvh":
 
-        @wp.func
-        def closest(
-            geometry: Geometry,
-            mesh: wp.uint64,
-            root: int,
-            first_triangle: int,
-            origin: wp.vec3,
-            direction: wp.vec3,
-            t_max: float,
-        ) -> TriangleHit:
-            return trace_triangles(geometry.bvh, root, origin, direction, t_max, False)
+    @wp.func
+    def trace_group(geometry: Geometry, group: Group, ray: Ray, nearest: Hit, any_will_do: bool) -> Hit:
+        hit = nearest
+        if wp.static(triangles):
+            if group.root >= 0:
+                if wp.static(accel == "bvh"):
+                    hit = trace_triangles(geometry, group.root, ray, hit, any_will_do)
+                else:
+                    hit = query_mesh(group, ray, hit, any_will_do)
+        if wp.static(spheres):
+            if group.sphere_root >= 0 and not (any_will_do and hit.primitive >= 0):
+                hit = trace_spheres(geometry, group.sphere_root, ray, hit, any_will_do)
+        return hit
 
-        @wp.func
-        def any_before(
-            geometry: Geometry, mesh: wp.uint64, root: int, origin: wp.vec3, direction: wp.vec3, t_max: float
-        ) -> bool:
-            return trace_triangles(geometry.bvh, root, origin, direction, t_max, True).primitive >= 0
+    return trace_group
 
-    else:
 
-        @wp.func
-        def closest(
-            geometry: Geometry,
-            mesh: wp.uint64,
-            root: int,
-            first_triangle: int,
-            origin: wp.vec3,
-            direction: wp.vec3,
-            t_max: float,
-        ) -> TriangleHit:
-            hit = TriangleHit()
-            hit.t = t_max
-            hit.primitive = -1
-            query = wp.mesh_query_ray(mesh, origin, direction, t_max)
-            if query.result and query.t < t_max:
-                hit.t = query.t
-                hit.primitive = first_triangle + query.face
-                hit.u = query.u
-                hit.v = query.v
-            return hit
+@functools.cache
+def make_instance_tracer(triangles: bool, spheres: bool, accel: str):
+    """`(geometry, root, ray, nearest, any_will_do) -> InstanceHit`, as `make_group_tracer`, below a node of instances.
 
-        @wp.func
-        def any_before(
-            geometry: Geometry, mesh: wp.uint64, root: int, origin: wp.vec3, direction: wp.vec3, t_max: float
-        ) -> bool:
-            return wp.mesh_query_ray_anyhit(mesh, origin, direction, t_max)
+    The arguments say what is in groups.
+    """
+    trace_group = make_group_tracer(triangles, spheres, accel)
 
-    return closest, any_before
+    @wp.func
+    def visit_instance(geometry: Geometry, link: int, ray: Ray, nearest: InstanceHit, any_will_do: bool) -> InstanceHit:
+        hit = nearest
+        index = ~link
+        instance = geometry.instances[index]
+        # The direction keeps its length in the world, so that parameters are those of the world.
+        local = make_ray(point_to_local(instance, ray.origin), instance.to_local * ray.direction)
+        met = Hit()
+        met.t = nearest.t
+        # Whether all primitives of this instance come before what was met at the same distance, or none.
+        before = wp.where(index < nearest.instance, LARGEST, -1)
+        met.primitive = before
+        met = trace_group(geometry, geometry.groups[instance.group], local, met, any_will_do)
+        if met.primitive != before:
+            hit.t = met.t
+            hit.primitive = met.primitive
+            hit.u = met.u
+            hit.v = met.v
+            hit.instance = index
+        return hit
+
+    return make_traversal(visit_instance, InstanceHit)
 
 
 @functools.cache
@@ -112,137 +122,33 @@ def make_intersector(
         accel: How triangles are found, one of `ACCELS`.
     """
     AnyHit = hit_type(instances)
-    group_triangles = "triangles" in instances
-    group_spheres = "spheres" in instances
-    closest_triangle, any_triangle = make_triangle_queries(accel)
+    trace_own = make_group_tracer(triangles, spheres, accel)
+    trace_instances = make_instance_tracer("triangles" in instances, "spheres" in instances, accel)
 
     @wp.func
-    def closest_in_group(geometry: Geometry, k: int, origin: wp.vec3, direction: wp.vec3, nearest: AnyHit) -> AnyHit:
-        hit = nearest
-        instance = geometry.instances[k]
-        group = geometry.groups[instance.group]
-        # The direction keeps its length in the world, so that parameters are those of the world.
-        local_origin = point_to_local(instance, origin)
-        local_direction = instance.to_local * direction
-        if wp.static(group_triangles):
-            if group.root >= 0:
-                found = closest_triangle(
-                    geometry, group.mesh, group.root, group.first_triangle, local_origin, local_direction, hit.t
-                )
-                if found.primitive >= 0:
-                    hit.t = found.t
-                    hit.primitive = found.primitive
-                    hit.u = found.u
-                    hit.v = found.v
-                    hit.instance = k
-        if wp.static(group_spheres):
-            if group.sphere_bvh != wp.uint64(0):
-                scale = wp.length(local_direction)
-                unit = local_direction / scale
-                t_local, sphere = closest_sphere(
-                    group.sphere_bvh, geometry.spheres, group.first_sphere, local_origin, unit, hit.t * scale
-                )
-                if sphere >= 0:
-                    hit.t = t_local / scale
-                    hit.primitive = geometry.triangle_count + sphere
-                    hit.instance = k
-        return hit
-
-    @wp.func
-    def any_in_group(geometry: Geometry, k: int, origin: wp.vec3, direction: wp.vec3, t_max: float) -> bool:
-        instance = geometry.instances[k]
-        group = geometry.groups[instance.group]
-        local_origin = point_to_local(instance, origin)
-        local_direction = instance.to_local * direction
-        if wp.static(group_triangles):
-            if group.root >= 0:
-                if any_triangle(geometry, group.mesh, group.root, local_origin, local_direction, t_max):
-                    return True
-        if wp.static(group_spheres):
-            if group.sphere_bvh != wp.uint64(0):
-                return any_sphere(
-                    group.sphere_bvh, geometry.spheres, group.first_sphere, local_origin, local_direction, t_max
-                )
-        return False
-
-    @wp.func
-    def closest_other(geometry: Geometry, origin: wp.vec3, direction: wp.vec3, nearest: AnyHit) -> AnyHit:
-        hit = nearest
-        if wp.static(spheres):
-            t, index = closest_sphere(geometry.sphere_bvh, geometry.spheres, 0, origin, direction, hit.t)
-            if index >= 0:
-                hit.t = t
-                hit.primitive = geometry.triangle_count + index
+    def trace(geometry: Geometry, origin: wp.vec3, direction: wp.vec3, t_max: float, any_will_do: bool) -> AnyHit:
+        ray = make_ray(origin, direction)
+        own = Hit()
+        own.t = t_max
+        own.primitive = -1
+        own = trace_own(geometry, geometry.own, ray, own, any_will_do)
+        hit = AnyHit()
+        hit.t = own.t
+        hit.primitive = own.primitive
+        hit.u = own.u
+        hit.v = own.v
         if wp.static(len(instances) > 0):
             hit.instance = -1
-            slope = slopes(direction)
-            links = Links()
-            distances = Distances()
-            size = int(1)
-            while size > 0:
-                size -= 1
-                link = links[size]
-                if distances[size] <= hit.t:
-                    if link >= 0:
-                        entered = box_distances(geometry.instance_bvh, link, origin, slope, hit.t)
-                        bottom = size
-                        for i in range(WIDTH):
-                            if entered[i] <= hit.t:
-                                # The nearest so far stays on top.
-                                last = wp.max(size - 1, 0)
-                                place = wp.where(size > bottom and entered[i] > distances[last], last, size)
-                                links[size] = links[place]
-                                distances[size] = distances[place]
-                                links[place] = geometry.instance_bvh.links[NODE_VECTORS * link + 1 + i // 4][i % 4]
-                                distances[place] = entered[i]
-                                size += 1
-                    elif link != EMPTY:
-                        k = geometry.instance_bvh.primitives[~link][0]
-                        hit = closest_in_group(geometry, k, origin, direction, hit)
+            if not (any_will_do and hit.primitive >= 0):
+                hit = trace_instances(geometry, geometry.instance_root, ray, hit, any_will_do)
         return hit
-
-    @wp.func
-    def occluded_by_other(geometry: Geometry, origin: wp.vec3, direction: wp.vec3, t_max: float) -> bool:
-        if wp.static(spheres):
-            if any_sphere(geometry.sphere_bvh, geometry.spheres, 0, origin, direction, t_max):
-                return True
-        if wp.static(len(instances) > 0):
-            slope = slopes(direction)
-            links = Links()
-            size = int(1)
-            while size > 0:
-                size -= 1
-                link = links[size]
-                if link >= 0:
-                    entered = box_distances(geometry.instance_bvh, link, origin, slope, t_max)
-                    for i in range(WIDTH):
-                        if entered[i] <= t_max:
-                            links[size] = geometry.instance_bvh.links[NODE_VECTORS * link + 1 + i // 4][i % 4]
-                            size += 1
-                elif link != EMPTY:
-                    k = geometry.instance_bvh.primitives[~link][0]
-                    if any_in_group(geometry, k, origin, direction, t_max):
-                        return True
-        return False
 
     @wp.func
     def closest_hit(geometry: Geometry, origin: wp.vec3, direction: wp.vec3) -> AnyHit:
-        hit = AnyHit()
-        hit.t = INFINITE
-        hit.primitive = -1
-        if wp.static(triangles):
-            found = closest_triangle(geometry, geometry.mesh, geometry.root, 0, origin, direction, INFINITE)
-            hit.t = found.t
-            hit.primitive = found.primitive
-            hit.u = found.u
-            hit.v = found.v
-        return closest_other(geometry, origin, direction, hit)
+        return trace(geometry, origin, direction, INFINITE, False)
 
     @wp.func
     def occluded(geometry: Geometry, origin: wp.vec3, direction: wp.vec3, t_max: float) -> bool:
-        if wp.static(triangles):
-            if any_triangle(geometry, geometry.mesh, geometry.root, origin, direction, t_max):
-                return True
-        return occluded_by_other(geometry, origin, direction, t_max)
+        return trace(geometry, origin, direction, t_max, True).primitive >= 0
 
-    return Intersector(closest_hit, occluded, closest_other, occluded_by_other)
+    return Intersector(closest_hit, occluded)

@@ -1,13 +1,17 @@
 """Rays against hierarchies in plain Warp, on either device: slabs of eight boxes, and a watertight triangle test.
 
 What is computed, and in which order of roundings, is the same in `wavefront.accel.stream`: of equal distances the
-triangle of the lowest number wins, so a hit depends on neither the order of traversal nor the device.
+primitive of the lowest number wins, so a hit depends on neither the order of traversal nor the device.
 """
+
+# Annotations are evaluated at once, for types of a function may depend on what it is made for.
+import functools
 
 import warp as wp
 
-from wavefront.accel.bvh import BLOCK, BLOCK_VECTORS, MAX_BLOCKS, MAX_LEVELS, NODE_VECTORS, STACK_SIZE, Bvh, Extents
+from wavefront.accel.bvh import BLOCK, BLOCK_VECTORS, MAX_BLOCKS, MAX_LEVELS, NODE_VECTORS, Bvh, Extents
 from wavefront.accel.collapse import EMPTY, WIDTH
+from wavefront.accel.geometry import Geometry, Hit
 
 # Slope of a direction along a plane: finite, for 0 times infinity is no distance, and so great that even 1e-17 m, such
 # as roundings leave of a zero, times it is beyond all hits.
@@ -33,8 +37,6 @@ UNMET = wp.constant(0x7F800000)  # the bits of infinity
 Keys = wp.types.vector(length=WIDTH, dtype=wp.int32)
 Levels = wp.types.vector(length=MAX_LEVELS, dtype=wp.int32)
 Waiting = wp.types.vector(length=MAX_LEVELS, dtype=wp.uint32)
-Links = wp.types.vector(length=STACK_SIZE, dtype=wp.int32)
-Distances = wp.types.vector(length=STACK_SIZE, dtype=wp.float32)
 
 
 @wp.struct
@@ -50,11 +52,13 @@ class Shear:
 
 
 @wp.struct
-class TriangleHit:
-    t: wp.float32
-    primitive: wp.int32  # -1: none
-    u: wp.float32  # weights of the first and second vertex
-    v: wp.float32
+class Ray:
+    """Of a direction of any length, with what tests of boxes and triangles need of it."""
+
+    origin: wp.vec3
+    direction: wp.vec3
+    slope: wp.vec3
+    shear: Shear
 
 
 @wp.func
@@ -89,6 +93,16 @@ def make_shear(d: wp.vec3) -> Shear:
     s.y = d[s.ky] / d[s.kz]
     s.z = 1.0 / d[s.kz]
     return s
+
+
+@wp.func
+def make_ray(origin: wp.vec3, direction: wp.vec3) -> Ray:
+    ray = Ray()
+    ray.origin = origin
+    ray.direction = direction
+    ray.slope = slopes(direction)
+    ray.shear = make_shear(direction)
+    return ray
 
 
 @wp.func
@@ -141,7 +155,7 @@ def difference_of_products(a: float, b: float, c: float, d: float) -> float:
 
 
 @wp.func
-def test_triangle(bvh: Bvh, block: int, k: int, origin: wp.vec3, shear: Shear, nearest: TriangleHit) -> TriangleHit:
+def test_triangle(bvh: Bvh, block: int, k: int, origin: wp.vec3, shear: Shear, nearest: Hit) -> Hit:
     """A triangle of a block, or the nearest that the ray met before, if that is nearer."""
     hit = nearest
     kx = shear.kx
@@ -197,40 +211,58 @@ def children_met(bvh: Bvh, node: int, origin: wp.vec3, slope: wp.vec3, t_max: fl
     return met
 
 
+@functools.cache
+def make_traversal(visit: wp.Function, AnyHit: type):
+    """A function that follows a ray through a hierarchy.
+
+    Args:
+        visit: `(geometry, link, ray, nearest, any_will_do) -> AnyHit`, as below, in a leaf.
+        AnyHit: The struct of a hit.
+
+    Returns:
+        `(geometry, root, ray, nearest, any_will_do) -> AnyHit`: the first of what is below a node and of `nearest`; or
+        any, if `nearest` is none.
+    """
+
+    @wp.func
+    def traverse(geometry: Geometry, root: int, ray: Ray, nearest: AnyHit, any_will_do: bool) -> AnyHit:
+        hit = nearest
+        # Nodes with children that wait, one a level: an eighth of the memory of a stack of those children.
+        nodes = Levels()
+        waiting = Waiting()
+        size = int(0)
+        link = int(root)
+        done = bool(False)
+        while not done:
+            if link >= 0:
+                nodes[size] = link
+                waiting[size] = children_met(geometry.bvh, link, ray.origin, ray.slope, hit.t)
+                size += 1
+            elif link != EMPTY:
+                hit = visit(geometry, link, ray, hit, any_will_do)
+                if any_will_do and hit.primitive >= 0:
+                    size = 0
+            while size > 0 and waiting[wp.max(size - 1, 0)] == wp.uint32(0):
+                size -= 1
+            if size > 0:
+                met = waiting[size - 1]
+                k = int(met & wp.uint32(7))
+                waiting[size - 1] = met >> wp.uint32(4)
+                link = geometry.bvh.links[NODE_VECTORS * nodes[size - 1] + 1 + k // 4][k % 4]
+            done = size == 0
+        return hit
+
+    return traverse
+
+
 @wp.func
-def trace_triangles(
-    bvh: Bvh, root: int, origin: wp.vec3, direction: wp.vec3, t_max: float, any_will_do: bool
-) -> TriangleHit:
-    """The first triangle below a node that a ray meets before `t_max`, or any."""
-    hit = TriangleHit()
-    hit.t = t_max
-    hit.primitive = -1
-    slope = slopes(direction)
-    shear = make_shear(direction)
-    # Nodes with children that wait, one a level: an eighth of the memory of a stack of those children.
-    nodes = Levels()
-    waiting = Waiting()
-    size = int(0)
-    link = int(root)
-    done = bool(False)
-    while not done:
-        if link >= 0:
-            nodes[size] = link
-            waiting[size] = children_met(bvh, link, origin, slope, hit.t)
-            size += 1
-        elif link != EMPTY:
-            first = ~link // MAX_BLOCKS
-            for block in range(first, first + ~link % MAX_BLOCKS + 1):
-                for k in range(BLOCK):
-                    hit = test_triangle(bvh, BLOCK_VECTORS * block, k, origin, shear, hit)
-            if any_will_do and hit.primitive >= 0:
-                size = 0
-        while size > 0 and waiting[wp.max(size - 1, 0)] == wp.uint32(0):
-            size -= 1
-        if size > 0:
-            met = waiting[size - 1]
-            k = int(met & wp.uint32(7))
-            waiting[size - 1] = met >> wp.uint32(4)
-            link = bvh.links[NODE_VECTORS * nodes[size - 1] + 1 + k // 4][k % 4]
-        done = size == 0
+def visit_triangles(geometry: Geometry, link: int, ray: Ray, nearest: Hit, any_will_do: bool) -> Hit:
+    hit = nearest
+    first = ~link // MAX_BLOCKS
+    for block in range(first, first + ~link % MAX_BLOCKS + 1):
+        for k in range(BLOCK):
+            hit = test_triangle(geometry.bvh, BLOCK_VECTORS * block, k, ray.origin, ray.shear, hit)
     return hit
+
+
+trace_triangles = make_traversal(visit_triangles, Hit)

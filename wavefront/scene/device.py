@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 import warp as wp
 
-from wavefront.accel.bvh import TriangleBvh, place_triangles
+from wavefront.accel.bvh import BoxBvh, TriangleBvh, place
 from wavefront.accel.geometry import Geometry, Shape
+from wavefront.accel.spheres import sphere_boxes
 from wavefront.bsdf import tables as bsdf_tables
 from wavefront.errors import SceneError
 from wavefront.film import LUMINANCE
@@ -121,7 +122,7 @@ class _Upload:
                 if any(getattr(part, field) for part in parts[1:])
             ),
             accel=self.accel,
-            streams=self.accel == "bvh" and wp.get_device(self.device).is_cpu,
+            streams=self.accel == "bvh" and wp.get_device(self.device).is_cpu and bool(self.shape_records),
             texture_kinds=tuple(sorted(set(self.atlas.kinds))),
             light_kinds=light_kinds,
             light_texture_kinds=tuple(sorted(self.light_texture_kinds)),
@@ -204,38 +205,48 @@ class _Upload:
         if spheres:
             table = np.array([[*center, radius] for _, center, radius, *_ in spheres], np.float32)
             geometry.spheres = wp.array(table, dtype=wp.vec4, device=device)
-            # The box is grown by some roundings, so that its sides never cut the sphere.
-            grown = table[:, 3:] + 1e-6 * (np.abs(table[:, :3]).max(axis=1, keepdims=True) + table[:, 3:])
-            lowers, uppers = table[:, :3] - grown, table[:, :3] + grown
-        hierarchies: list[tuple[Part, TriangleBvh]] = []
+            for part in parts:
+                part.spheres = table[part.first_sphere : part.first_sphere + part.sphere_count]
+        bounds = self._build(geometry, parts)
+        return geometry, bounds if len(counts) else np.zeros((2, 3)), parts
+
+    def _build(self, geometry: Geometry, parts: list[Part]) -> np.ndarray:
+        """Builds the hierarchies of the scene itself, of groups and of instances; returns the bounds of all."""
+        hierarchies = []  # (where its root is written to, itself, what it is fitted to)
+
+        def add_boxes(owner, name: str, corners: np.ndarray, first: int = 0) -> None:
+            boxes = [wp.array(corner, dtype=wp.vec3, device=self.device) for corner in corners]
+            hierarchies.append(((owner, name), BoxBvh(*boxes, first, alone=False), *boxes))
+
         for part in parts:
-            triangles = slice(part.first_triangle, part.first_triangle + part.triangle_count)
-            balls = slice(part.first_sphere, part.first_sphere + part.sphere_count)
             if part.triangle_count:
                 # Vertices are those of all.
-                indices = geometry.indices[3 * triangles.start : 3 * triangles.stop]
+                points, end = geometry.points, part.first_triangle + part.triangle_count
+                indices = geometry.indices[3 * part.first_triangle : 3 * end]
                 if self.accel == "bvh":
-                    hierarchies.append((part, TriangleBvh(geometry.points, indices, part.first_triangle)))
+                    bvh = TriangleBvh(points, indices, part.first_triangle, alone=False)
+                    hierarchies.append(((part.group, "root"), bvh, points))
                 else:  # leaves of 2 triangles traced fastest of 1, 2, 4 and 8 on the CPU device
-                    mesh = wp.Mesh(geometry.points, indices, bvh_constructor="sah", bvh_leaf_size=2)
+                    mesh = wp.Mesh(points, indices, bvh_constructor="sah", bvh_leaf_size=2)
                     self.keep_alive.append(mesh)
-                    part.mesh, part.root = mesh.id, 0
+                    part.group.mesh, part.group.root = mesh.id, 0
             if part.sphere_count:
-                boxes = (wp.array(corner[balls], dtype=wp.vec3, device=device) for corner in (lowers, uppers))
-                bvh = wp.Bvh(*boxes)
-                self.keep_alive.append(bvh)
-                part.sphere_bvh = bvh.id
-                part.enclose([lowers[balls], uppers[balls]])
-        if hierarchies:
-            geometry.bvh = place_triangles([bvh for _, bvh in hierarchies], geometry.points)
-            for part, bvh in hierarchies:
-                part.root = bvh.first_node
-        geometry.root, geometry.mesh, geometry.sphere_bvh = parts[0].root, parts[0].mesh, parts[0].sphere_bvh
+                boxes = sphere_boxes(part.spheres)
+                add_boxes(part.group, "sphere_root", boxes, part.first_sphere)
+                part.enclose(boxes)
         bounds = parts[0].bounds
         if len(parts) > 1:
-            instances = self.instances.upload(geometry, parts[1:])
-            bounds = np.array([np.minimum(bounds[0], instances[0]), np.maximum(bounds[1], instances[1])])
-        return geometry, bounds if len(counts) else np.zeros((2, 3)), parts
+            lower, upper = self.instances.boxes(parts[1:])
+            add_boxes(geometry, "instance_root", (lower, upper))
+            bounds = np.array([np.minimum(bounds[0], lower.min(axis=0)), np.maximum(bounds[1], upper.max(axis=0))])
+        if hierarchies:
+            geometry.bvh = place([placed for _, *placed in hierarchies])
+            for (owner, name), bvh, *_ in hierarchies:
+                setattr(owner, name, bvh.first_node)
+        geometry.own = parts[0].group
+        if len(parts) > 1:
+            self.instances.upload(geometry, parts[1:])
+        return bounds
 
     # --- lights ----------------------------------------------------------------------------------------------------
 

@@ -8,11 +8,9 @@ from collections.abc import Iterable
 import numpy as np
 import warp as wp
 
-from wavefront.accel.bvh import BoxBvh
 from wavefront.accel.geometry import Geometry
-from wavefront.accel.instance import Group, Instance
+from wavefront.accel.instance import Group, Instance, no_shapes
 from wavefront.scene import description
-from wavefront.scene.texture_upload import struct_array
 from wavefront.scene.transforms import to_matrix
 from wavefront.surface import POSITION_ERROR
 
@@ -25,9 +23,8 @@ class Part:
     triangle_count: int
     first_sphere: int
     sphere_count: int
-    root: int = -1  # of its triangles in the hierarchy of all; -1: it has none
-    mesh: int = 0  # handle of a `wp.Mesh`, if those were chosen
-    sphere_bvh: int = 0
+    group: Group = dataclasses.field(default_factory=no_shapes)
+    spheres: np.ndarray | None = None  # centre and radius, [N, 4] float32
     bounds: np.ndarray = dataclasses.field(default_factory=lambda: np.array([np.full(3, np.inf), np.full(3, -np.inf)]))
 
     def enclose(self, points: Iterable[np.ndarray]) -> None:
@@ -54,23 +51,12 @@ class InstanceUpload:
         matrices = [to_matrix(item.to_world, f"instances[{i}].to_world") for i, item in enumerate(scene.instances)]
         self.matrices = np.array(matrices).reshape(-1, 4, 4)
 
-    def upload(self, geometry: Geometry, parts: list[Part]) -> np.ndarray:
-        """Fills in the instances of `geometry` and returns their bounds, lower and upper corner.
+    def boxes(self, parts: list[Part]) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corners of the box of each instance, [N, 3] float32.
 
         Args:
-            geometry: Changed.
             parts: Of each group.
         """
-        host = np.zeros(len(self.matrices), Instance.numpy_dtype())
-        # The inverse is that of the rounded matrix.
-        host["to_world"], host["translation"] = self.matrices[:, :3, :3], self.matrices[:, :3, 3]
-        host["to_local"] = np.linalg.inv(host["to_world"].astype(np.float64))
-        host["group"] = self.group_of
-        geometry.instances = wp.array(host, dtype=Instance, device=self.device)
-        names = ("root", "mesh", "sphere_bvh", "first_triangle", "first_sphere")
-        records = [{name: getattr(part, name) for name in names} for part in parts]
-        geometry.groups = struct_array(Group, records, self.device)
-
         bounds = np.array([part.bounds for part in parts])[self.group_of]
         linear, translation = np.abs(self.matrices[:, :3, :3]), self.matrices[:, :3, 3]
         center = np.einsum("nij,nj->ni", self.matrices[:, :3, :3], bounds.mean(axis=1)) + translation
@@ -79,7 +65,14 @@ class InstanceUpload:
         half += float(POSITION_ERROR) * (
             np.einsum("nij,nj->ni", linear, np.abs(bounds).max(axis=1)) + np.abs(translation)
         )
-        lower, upper = ((center + sign * half).astype(np.float32) for sign in (-1.0, 1.0))
-        boxes = (wp.array(corner, dtype=wp.vec3, device=self.device) for corner in (lower, upper))
-        geometry.instance_bvh = BoxBvh(*boxes).bvh
-        return np.array([lower.min(axis=0), upper.max(axis=0)])
+        return tuple((center + sign * half).astype(np.float32) for sign in (-1.0, 1.0))
+
+    def upload(self, geometry: Geometry, parts: list[Part]) -> None:
+        """Fills in the instances of `geometry`, all but the hierarchy of their boxes."""
+        host = np.zeros(len(self.matrices), Instance.numpy_dtype())
+        # The inverse is that of the rounded matrix.
+        host["to_world"], host["translation"] = self.matrices[:, :3, :3], self.matrices[:, :3, 3]
+        host["to_local"] = np.linalg.inv(host["to_world"].astype(np.float64))
+        host["group"] = self.group_of
+        geometry.instances = wp.array(host, dtype=Instance, device=self.device)
+        geometry.groups = wp.array([part.group for part in parts], dtype=Group, device=self.device)

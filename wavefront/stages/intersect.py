@@ -6,10 +6,10 @@ import functools
 
 import warp as wp
 
-from wavefront.accel.geometry import INFINITE, Geometry, hit_type
+from wavefront.accel.geometry import INFINITE, Geometry, RayHits, hit_type
 from wavefront.accel.intersector import make_intersector
 from wavefront.medium import transmittance
-from wavefront.queues import DEPTH, Paths, Queue, Surfaces, TriangleHits, push, queue_size
+from wavefront.queues import DEPTH, Paths, Queue, Surfaces, push, queue_size
 from wavefront.stage_kernel import stage_kernel
 from wavefront.surface import make_vertex
 
@@ -34,9 +34,9 @@ def make_intersect(
 
     `shape_index`: whether the index of the shape is an AOV.
     """
-    intersector = make_intersector(triangles, spheres, instances, accel)
-    closest_hit, closest_other, AnyHit = intersector.closest_hit, intersector.closest_other, hit_type(instances)
-    traced = triangles and streams
+    closest_hit = make_intersector(triangles, spheres, instances, accel).closest_hit
+    AnyHit = hit_type(instances)
+    instanced = bool(instances)
     vertex_of = make_vertex(triangles, spheres, smooth, uvs, tangents, bumps, instances)
 
     @stage_kernel
@@ -44,7 +44,7 @@ def make_intersect(
         geometry: Geometry,
         paths: Paths,  # also out, where a medium absorbs
         rays: Queue,
-        triangle_hits: TriangleHits,
+        ray_hits: RayHits,
         max_depth: int,
         # out
         surfaces: Surfaces,
@@ -60,12 +60,13 @@ def make_intersect(
         origin = paths.origin[slot]
         direction = paths.direction[slot]
         hit = AnyHit()
-        if wp.static(traced):
-            hit.t = triangle_hits.t[slot]
-            hit.primitive = triangle_hits.primitive[slot]
-            hit.u = triangle_hits.uv[slot][0]
-            hit.v = triangle_hits.uv[slot][1]
-            hit = closest_other(geometry, origin, direction, hit)
+        if wp.static(streams):
+            hit.t = ray_hits.t[slot]
+            hit.primitive = ray_hits.primitive[slot]
+            hit.u = ray_hits.uv[slot][0]
+            hit.v = ray_hits.uv[slot][1]
+            if wp.static(instanced):
+                hit.instance = ray_hits.instance[slot]
         else:
             hit = closest_hit(geometry, origin, direction)
         if wp.static(media):

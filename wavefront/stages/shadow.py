@@ -21,9 +21,7 @@ def make_shadow(
     streams: bool = False,
 ):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
-    intersector = make_intersector(triangles, spheres, instances, accel)
-    occluded, occluded_by_other = intersector.occluded, intersector.occluded_by_other
-    traced = triangles and streams
+    occluded = make_intersector(triangles, spheres, instances, accel).occluded
 
     @stage_kernel
     def trace_shadow_rays(
@@ -38,12 +36,8 @@ def make_shadow(
             return
         slot = shadow.slots[i]
         blocked = bool(False)
-        if wp.static(traced):
+        if wp.static(streams):
             blocked = shadow_rays.blocked[slot] == 1
-            if not blocked:
-                blocked = occluded_by_other(
-                    geometry, shadow_rays.origin[slot], shadow_rays.direction[slot], shadow_rays.t_max[slot]
-                )
         else:
             blocked = occluded(geometry, shadow_rays.origin[slot], shadow_rays.direction[slot], shadow_rays.t_max[slot])
         if not blocked:
