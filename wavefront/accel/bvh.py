@@ -1,12 +1,13 @@
 """Hierarchies with eight children a node, over triangles and over boxes, as the traversal reads them.
 
-A node is 96 bytes, much as that of Ylitie, Karras and Laine (2017): the origin of a grid, the exponents of its cell
-widths, eight links (see `wavefront.accel.collapse.link`), and the corners of the boxes of its children in cells, a byte
-each: the lower x of all eight, then y and z, then the upper ones. float32 holds all points of the grid exactly, so that
-a corner is the same however it is computed; boxes are rounded outwards by at most a cell. A leaf is one or two blocks
-of four triangles: the x of their first vertices, then y and z, then those of the second and third vertices, then the
-indices of the triangles; places without a triangle hold NaN. So that eight boxes or four triangles are tested at once,
-each with one vector instruction a coordinate. In a hierarchy of boxes a leaf is a box, and its link the box's number.
+A node is 112 bytes, much as that of Ylitie, Karras and Laine (2017): the origin of a grid and the widths of its cells,
+each a vector of four, eight links (see `wavefront.accel.collapse.link`), and the corners of the boxes of its children
+in cells, a byte each: the lower x of all eight, then y and z, then the upper ones. The grid spans the box of the node,
+and the sides of that stay where they are, for rays start from walls that lie in them; other corners are rounded
+outwards by at most a cell. A leaf is one or two blocks of four triangles: the x of their first vertices, then y and z,
+then those of the second and third vertices, then the indices of the triangles; places without a triangle hold NaN. So
+that eight boxes or four triangles are tested at once, each with one vector instruction a coordinate. In a hierarchy of
+boxes a leaf is a box, and its link the box's number.
 """
 
 from __future__ import annotations
@@ -23,15 +24,11 @@ from wavefront.accel.collapse import BLOCK_COST, EMPTY, NODE_COST, WIDTH, Childr
 
 BLOCK = 4  # triangles of a block
 MAX_BLOCKS = 2  # of a leaf
-NODE_VECTORS = 6
+NODE_VECTORS = 7
 BLOCK_VECTORS = 10
 MAX_LEVELS = 22  # of a hierarchy
 STACK_SIZE = 160  # entries a traversal needs: a level leaves seven nodes for later, and the last eight
-CELLS = wp.constant(255.0)  # of the grid of a node along an axis
-# Widths of cells, in metres: none so small that a ray along a box's side would leave it at once (see
-# `wavefront.accel.traverse.STEEPEST`), none beyond what float32 holds.
-MIN_EXPONENT = wp.constant(127 - 56)
-MAX_EXPONENT = wp.constant(254)
+CELLS = wp.constant(255)  # of the grid of a node along an axis
 
 wp.set_module_options({"enable_backward": False})
 
@@ -127,39 +124,56 @@ def write_links(links: wp.array[Children], node_offset: int, block_offset: int, 
             link += node_offset
         elif link != EMPTY:
             link -= block_offset
-        bvh.links[NODE_VECTORS * (node_offset + i) + 1 + k // 4][k % 4] = link
+        bvh.links[NODE_VECTORS * (node_offset + i) + 2 + k // 4][k % 4] = link
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __fmaf_rn((float)cell, width, origin);
+#else
+    return __builtin_fmaf((float)cell, width, origin);
+#endif
+""")
+def grid_point(origin: float, width: float, cell: int) -> float:
+    """Coordinate of the lower side of a cell, rounded once, so that it is the same wherever it is computed."""
+    ...
 
 
 @wp.func
-def cell_below(x: float, width: float) -> float:
-    """The cell of a grid, counted from zero, whose lower end is strictly below x.
-
-    Strictly, so that a ray within the side of a box is within the box.
-    """
-    return wp.ceil(x / width) - 1.0
+def next_above(x: float) -> float:
+    """The next larger number, of one that is not negative."""
+    return wp.cast(wp.cast(x, wp.int32) + 1, wp.float32)
 
 
 @wp.func
-def cell_above(x: float, width: float) -> float:
-    return wp.floor(x / width) + 1.0
+def cell_width(lower: float, upper: float) -> float:
+    """The least with which `CELLS` cover an interval."""
+    width = (0.5 * upper - 0.5 * lower) / (0.5 * float(CELLS))  # halves, for the extent may overflow
+    while grid_point(lower, width, CELLS) < upper:
+        width = next_above(width)
+    return width
 
 
 @wp.func
-def grid_exponent(lower: float, upper: float) -> int:
-    """Biased exponent of the least power of two of which `CELLS` cover an interval.
+def cell_below(origin: float, width: float, x: float) -> int:
+    """The last cell of which the lower side is not above x."""
+    cell = int(0)
+    if width > 0.0:
+        cell = wp.clamp(int((x - origin) / width) + 1, 0, CELLS)
+        while grid_point(origin, width, cell) > x:
+            cell -= 1
+    return cell
 
-    And of which the corners are multiples by less than 2^24, so that the grid is exact: its width times a byte added to
-    its origin rounds nothing.
-    """
-    # Halves, for the extent may overflow.
-    width = wp.max((0.5 * upper - 0.5 * lower) / 128.0, wp.max(wp.abs(lower), wp.abs(upper)) / 4194304.0)
-    exponent = wp.max(wp.cast(width, wp.int32) >> 23, MIN_EXPONENT)
-    while exponent < MAX_EXPONENT:
-        width = wp.cast(exponent << 23, wp.float32)
-        if cell_above(upper, width) - cell_below(lower, width) <= CELLS:
-            break
-        exponent += 1
-    return exponent
+
+@wp.func
+def cell_above(origin: float, width: float, x: float) -> int:
+    """The first cell of which the lower side is not below x."""
+    cell = int(0)
+    if width > 0.0:
+        cell = wp.clamp(int((x - origin) / width) - 1, 0, CELLS)
+        while grid_point(origin, width, cell) < x:
+            cell += 1
+    return cell
 
 
 @wp.kernel
@@ -177,7 +191,7 @@ def fit_nodes(
 ):
     """Boxes of the nodes of one level and of their children, from those of blocks and of the level below.
 
-    Those of nodes, from `first_node` on, are exact: what one level was rounded by is not rounded again by the next.
+    Those of nodes, counted from `first_node`, are exact: what one level is rounded by is not rounded again above.
     """
     i = offset + wp.tid()
     node = NODE_VECTORS * (first_node + i)
@@ -186,7 +200,7 @@ def fit_nodes(
     box_lower = wp.vec3(wp.inf)
     box_upper = wp.vec3(-wp.inf)
     for k in range(WIDTH):
-        link = bvh.links[node + 1 + k // 4][k % 4]
+        link = bvh.links[node + 2 + k // 4][k % 4]
         child_lower = wp.vec3(wp.inf)
         child_upper = wp.vec3(-wp.inf)
         if link >= 0:
@@ -204,13 +218,11 @@ def fit_nodes(
         box_upper = wp.max(box_upper, child_upper)
     node_lower[i] = box_lower
     node_upper[i] = box_upper
-    exponents = int(0)
     for axis in range(3):
-        exponent = grid_exponent(box_lower[axis], box_upper[axis])
-        exponents |= exponent << (8 * axis)
-        width = wp.cast(exponent << 23, wp.float32)
-        origin = cell_below(box_lower[axis], width)
-        bvh.nodes[node][axis] = origin * width
+        origin = box_lower[axis]
+        width = cell_width(origin, box_upper[axis])
+        bvh.nodes[node][axis] = origin
+        bvh.nodes[node + 1][axis] = width
         for half in range(2):
             lower_cells = int(0)
             upper_cells = int(0)
@@ -220,13 +232,12 @@ def fit_nodes(
                 first_cell = int(CELLS)
                 last_cell = int(0)
                 if low[axis, k] <= high[axis, k]:
-                    first_cell = int(cell_below(low[axis, k], width) - origin)
-                    last_cell = int(cell_above(high[axis, k], width) - origin)
+                    first_cell = cell_below(origin, width, low[axis, k])
+                    last_cell = cell_above(origin, width, high[axis, k])
                 lower_cells |= first_cell << (8 * j)
                 upper_cells |= last_cell << (8 * j)
-            bvh.links[node + 3 + (2 * axis + half) // 4][(2 * axis + half) % 4] = lower_cells
-            bvh.links[node + 3 + (6 + 2 * axis + half) // 4][(6 + 2 * axis + half) % 4] = upper_cells
-    bvh.links[node][3] = exponents
+            bvh.links[node + 4 + (2 * axis + half) // 4][(2 * axis + half) % 4] = lower_cells
+            bvh.links[node + 4 + (6 + 2 * axis + half) // 4][(6 + 2 * axis + half) % 4] = upper_cells
 
 
 @dataclasses.dataclass(frozen=True)
@@ -289,13 +300,12 @@ class _Hierarchy:
 
     def statistics(self) -> Statistics:
         """Reads the tables back; takes time."""
-        nodes = self.bvh.links.numpy().reshape(-1, 4 * NODE_VECTORS)
+        nodes = self.bvh.nodes.numpy().reshape(-1, 4 * NODE_VECTORS)
         nodes = nodes[self.first_node : self.first_node + self.node_count]
         # The origins of grids do not count.
-        width = np.ldexp(1.0, (nodes[:, 3:4] >> (0, 8, 16) & 255) - 127)
-        cells = nodes[:, 12:].copy().view(np.uint8).reshape(-1, 2, 3, WIDTH)
-        lower, upper = (cells[:, i] * width[:, :, None] for i in range(2))
-        links = nodes[:, 4:12]
+        cells = nodes[:, 16:].copy().view(np.uint8).reshape(-1, 2, 3, WIDTH)
+        lower, upper = (cells[:, i] * nodes[:, 4:7, None].astype(np.float64) for i in range(2))
+        links = nodes[:, 8:16].view(np.int32)
         used = links != EMPTY
         d = np.where(used[:, None], upper - lower, 0.0)
         areas = d[:, 0] * d[:, 1] + d[:, 1] * d[:, 2] + d[:, 2] * d[:, 0]
@@ -303,8 +313,8 @@ class _Hierarchy:
         root = d[0] * d[1] + d[1] * d[2] + d[2] * d[0]
         leaves = used & (links < 0)
         blocks = np.where(leaves, ~links % self.max_blocks + 1, 0)
-        node_visits = 1.0 + float(areas[used & ~leaves].sum() / root)
-        block_visits = float((areas * blocks).sum() / root)
+        node_visits = 1.0 + float(areas[used & ~leaves].sum() / root) if root > 0.0 else 0.0
+        block_visits = float((areas * blocks).sum() / root) if root > 0.0 else 0.0
         vectors = self.node_count * NODE_VECTORS + self.block_count * self._block_vectors
         return Statistics(
             primitives=self.primitive_count,
@@ -401,7 +411,7 @@ def place(hierarchies: list[tuple]) -> Bvh:
     nodes = sum(h.node_count for h, *_ in hierarchies)
     vectors = sum(h.block_count * h._block_vectors for h, *_ in hierarchies)
     bvh = Bvh()
-    bvh.nodes = wp.empty(NODE_VECTORS * nodes, dtype=wp.vec4, device=device)
+    bvh.nodes = wp.zeros(NODE_VECTORS * nodes, dtype=wp.vec4, device=device)
     bvh.blocks = wp.empty(vectors, dtype=wp.vec4, device=device)
     bvh.links, bvh.primitives = bvh.nodes.view(wp.vec4i), bvh.blocks.view(wp.vec4i)
     first_node = first_vector = 0

@@ -59,7 +59,7 @@ _STREAM = """
     enum Kind { NONE, TRIANGLE, SPHERE, INSTANCE };
     struct Space {
         vec3 o, d;
-        float near_slope[3], far_slope[3];
+        float far_o[3], near_slope[3], far_slope[3];
         int near_side[3], far_side[3];  // bytes from the beginning of a node
         int kx, ky, kz;
         float shear_x, shear_y, shear_z;
@@ -84,8 +84,11 @@ _STREAM = """
             const float slope = along ? __builtin_copysignf(STEEPEST, d[k]) : 1.0f / d[k];
             r.near_slope[k] = slope * NEAR_SLACK;
             r.far_slope[k] = slope * FAR_SLACK;
-            r.near_side[k] = 48 + 8 * k + (slope < 0.0f ? 24 : 0);
-            r.far_side[k] = 48 + 8 * k + (slope < 0.0f ? 0 : 24);
+            // See `far_origin`.
+            const float back = along ? __builtin_fmaxf(1.2e-7f * __builtin_fabsf(o[k]), 1.0e-17f) : 0.0f;
+            r.far_o[k] = o[k] - __builtin_copysignf(back, d[k]);
+            r.near_side[k] = 64 + 8 * k + (slope < 0.0f ? 24 : 0);
+            r.far_side[k] = 64 + 8 * k + (slope < 0.0f ? 0 : 24);
         }
         r.kz = 0;
         if (__builtin_fabsf(d[1]) > __builtin_fabsf(d[r.kz])) r.kz = 1;
@@ -155,21 +158,18 @@ _STREAM = """
             Ray& r = rays[a];
             if (r.link >= 0) {
                 const float* const node = nodes + (size_t)r.link * node_size;
-                const int exponents = ((const int*)node)[3];
-                auto side = [&](int axis, int place) -> float8 {
-                    const float width = __builtin_bit_cast(float, (exponents >> 8 * axis & 255) << 23);
-                    const bytes8 cells = *(const bytes8*)((const char*)node + place);
-                    // Exact.
+                auto side = [&](int axis, int place, float origin) -> float8 {
+                    const float8 cells = __builtin_convertvector(*(const bytes8*)((const char*)node + place), float8);
                     const float8 corners = __builtin_elementwise_fma(
-                        __builtin_convertvector(cells, float8), (float8)(width), (float8)(node[axis]));
-                    return corners - r.o[axis];
+                        cells, (float8)(node[4 + axis]), (float8)(node[axis]));
+                    return corners - origin;
                 };
-                const float8 nx = side(0, r.near_side[0]) * r.near_slope[0];
-                const float8 ny = side(1, r.near_side[1]) * r.near_slope[1];
-                const float8 nz = side(2, r.near_side[2]) * r.near_slope[2];
-                const float8 fx = side(0, r.far_side[0]) * r.far_slope[0];
-                const float8 fy = side(1, r.far_side[1]) * r.far_slope[1];
-                const float8 fz = side(2, r.far_side[2]) * r.far_slope[2];
+                const float8 nx = side(0, r.near_side[0], r.o[0]) * r.near_slope[0];
+                const float8 ny = side(1, r.near_side[1], r.o[1]) * r.near_slope[1];
+                const float8 nz = side(2, r.near_side[2], r.o[2]) * r.near_slope[2];
+                const float8 fx = side(0, r.far_side[0], r.far_o[0]) * r.far_slope[0];
+                const float8 fy = side(1, r.far_side[1], r.far_o[1]) * r.far_slope[1];
+                const float8 fz = side(2, r.far_side[2], r.far_o[2]) * r.far_slope[2];
                 float8 near = nx > ny ? nx : ny, far = fx < fy ? fx : fy;
                 near = near > nz ? near : nz;
                 far = far < fz ? far : fz;
@@ -249,7 +249,7 @@ _STREAM = """
                 --r.size;
                 const int key = r.keys[r.size];
                 if ((key & ~7) <= __builtin_bit_cast(int, r.t)) {
-                    r.link = ((const int*)nodes)[(size_t)r.nodes[r.size] * node_size + 4 + (key & 7)];
+                    r.link = ((const int*)nodes)[(size_t)r.nodes[r.size] * node_size + 8 + (key & 7)];
                     if (r.link == EMPTY) continue;
                     const char* const memory = r.link >= 0
                         ? (const char*)(nodes + (size_t)r.link * node_size)

@@ -9,7 +9,7 @@ import functools
 
 import warp as wp
 
-from wavefront.accel.bvh import BLOCK, BLOCK_VECTORS, MAX_BLOCKS, MAX_LEVELS, NODE_VECTORS, Bvh, Extents
+from wavefront.accel.bvh import BLOCK, BLOCK_VECTORS, MAX_BLOCKS, MAX_LEVELS, NODE_VECTORS, Bvh, Extents, grid_point
 from wavefront.accel.collapse import EMPTY, WIDTH
 from wavefront.accel.geometry import Geometry, Hit
 
@@ -70,6 +70,16 @@ def slope(d: float) -> float:
 
 
 @wp.func
+def far_origin(x: float, slope: float) -> float:
+    """Coordinate of the origin of a ray for the sides where it leaves boxes.
+
+    A ray along an axis starts a rounding further back, so that one within the side of a box is within the box.
+    """
+    back = wp.where(wp.abs(slope) == STEEPEST, wp.max(1.2e-7 * wp.abs(x), 1.0e-17), 0.0)
+    return x - wp.sign(slope) * back
+
+
+@wp.func
 def slopes(direction: wp.vec3) -> wp.vec3:
     return wp.vec3(slope(direction[0]), slope(direction[1]), slope(direction[2]))
 
@@ -112,25 +122,24 @@ def box_distances(bvh: Bvh, node: int, origin: wp.vec3, slope: wp.vec3, t_max: f
     near = Extents(0.0)
     far = Extents(t_max)
     place = NODE_VECTORS * node
-    grid = bvh.nodes[place]
-    exponents = bvh.links[place][3]
     for axis in range(3):
-        width = wp.cast(((exponents >> (8 * axis)) & 255) << 23, wp.float32)
+        grid = bvh.nodes[place][axis]
+        width = bvh.nodes[place + 1][axis]
+        beside = far_origin(origin[axis], slope[axis])
         for half in range(2):
             word = 2 * axis + half
-            near_cells = bvh.links[place + 3 + word // 4][word % 4]
-            far_cells = bvh.links[place + 3 + (6 + word) // 4][(6 + word) % 4]
+            near_cells = bvh.links[place + 4 + word // 4][word % 4]
+            far_cells = bvh.links[place + 4 + (6 + word) // 4][(6 + word) % 4]
             if slope[axis] < 0.0:
                 swap = near_cells
                 near_cells = far_cells
                 far_cells = swap
             for i in range(4):
-                # Exact.
-                near_side = grid[axis] + float((near_cells >> (8 * i)) & 255) * width
-                far_side = grid[axis] + float((far_cells >> (8 * i)) & 255) * width
+                near_side = grid_point(grid, width, (near_cells >> (8 * i)) & 255)
+                far_side = grid_point(grid, width, (far_cells >> (8 * i)) & 255)
                 k = 4 * half + i
                 near[k] = wp.max(near[k], (near_side - origin[axis]) * (slope[axis] * NEAR_SLACK))
-                far[k] = wp.min(far[k], (far_side - origin[axis]) * (slope[axis] * FAR_SLACK))
+                far[k] = wp.min(far[k], (far_side - beside) * (slope[axis] * FAR_SLACK))
     for k in range(WIDTH):
         found[k] = wp.where(near[k] <= far[k], near[k], float(wp.inf))
     return found
@@ -248,7 +257,7 @@ def make_traversal(visit: wp.Function, AnyHit: type):
                 met = waiting[size - 1]
                 k = int(met & wp.uint32(7))
                 waiting[size - 1] = met >> wp.uint32(4)
-                link = geometry.bvh.links[NODE_VECTORS * nodes[size - 1] + 1 + k // 4][k % 4]
+                link = geometry.bvh.links[NODE_VECTORS * nodes[size - 1] + 2 + k // 4][k % 4]
             done = size == 0
         return hit
 
