@@ -88,7 +88,8 @@ def test_both_ways_find_the_same(own, groups):
 @pytest.mark.parametrize("groups", GROUPS)
 @pytest.mark.parametrize("kind", TRANSFORMS)
 def test_of_equal_distances_the_first_instance_wins_and_the_scene_itself_before_all(kind, groups):
-    """Five copies of each of six instances in a mixed order, one of which is where the scene itself has the same."""
+    """Five copies of each of six instances in a mixed order, one of which is where the scene itself has the same. Some
+    have a speck beside them, so that rays come to their larger boxes first."""
     rng = np.random.default_rng(7)
     own = groups
     common = shapes(rng, 30, *OWN[own])
@@ -96,8 +97,15 @@ def test_of_equal_distances_the_first_instance_wins_and_the_scene_itself_before_
     linear /= np.abs(np.linalg.det(linear))[:, None, None] ** (1.0 / 3.0)
     linear[0], place[0] = np.eye(3), 0.0
     order = np.concatenate([rng.permutation(6) for _ in range(5)])
-    instances = [d.Instance(group="g", to_world=matrix(linear[k], place[k])) for k in order]
-    scene = d.Scene(shapes=common, groups=[d.Group(name="g", shapes=common)], instances=instances)
+    names = rng.choice(["plain", "specked"], len(order))
+    instances = [
+        d.Instance(group=name, to_world=matrix(linear[k], place[k])) for k, name in zip(order, names, strict=True)
+    ]
+    speck = d.Mesh(vertices=[(5.0, 5.0, 5.0), (5.0, 5.0, 5.0001), (5.0, 5.0001, 5.0)], faces=[(0, 1, 2)])
+    if groups == "balls":
+        speck = d.Sphere(center=(5.0, 5.0, 5.0), radius=1e-4)
+    members = [d.Group(name="plain", shapes=common), d.Group(name="specked", shapes=[*common, speck])]
+    scene = d.Scene(shapes=common, groups=members, instances=instances)
     origin, direction = rays(rng, 10000, place)
     hits = check(scene, own, groups, origin, direction)
     first = np.array([np.flatnonzero(order == order[k])[0] for k in range(len(order))])
