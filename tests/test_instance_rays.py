@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.accel import tracing
 from tests.test_surface import (
     DEVICE,
     Soup,
@@ -115,8 +116,18 @@ class World(Soup):
         return [a.numpy() for a in out]
 
     def trace(self, origin, direction, t_max):
+        """Hits, vertices, and what is blocked; asserts that streams find the same bits."""
         inputs = [np.float32(origin), np.float32(direction), np.float32(t_max)]
-        return self.launch(trace_kernel, inputs, [InstanceHit, Vertex, int])
+        hits, vertices, blocked = self.launch(trace_kernel, inputs, [InstanceHit, Vertex, int])
+        stream = tracing.make_kernels(False, False, KINDS)[1]
+        found = tracing.launch(stream, self.geometry, *inputs[:2])
+        for name in ("t", "primitive", "instance"):
+            assert (getattr(found, name) == hits[name]).all(), name
+        assert (found.uv == np.column_stack([hits["u"], hits["v"]])).all()
+        scale = np.float32(0.3)
+        found = tracing.launch(stream, self.geometry, inputs[0], scale * inputs[1], inputs[2] / scale)
+        assert (found.blocked == blocked).all()
+        return hits, vertices, blocked
 
     def leave(self, instance, primitive, u, v, leaving, origin=None, direction=None, t=None):
         hits = np.zeros(len(primitive), InstanceHit.numpy_dtype())

@@ -6,23 +6,21 @@ drawn from fixed seeds.
 
 import numpy as np
 import pytest
-import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.accel.oracle import check, judge
 from tests.accel.soups import SOUPS, hard_rays, on_triangles
 from tests.accel.tracing import (
-    DEVICE,
     FAR,
     check_any,
+    launch,
     portable_kernel,
     soup_bvh,
     stream_kernel,
     trace,
     trace_both,
     triangles_below,
-    vectors,
 )
 
 COUNTS = (1, 2, 3, 8, 9, 60, 300)
@@ -153,12 +151,9 @@ def test_a_stream_of_any_length_leaves_other_slots_alone():
     for count in (0, 1, 15, 16, 17, 100):
         origin, direction = hard_rays(rng, corners, 2 * count + 2)
         expected = trace(portable_kernel, bvh, 0, origin, direction)
-        slots = wp.array(2 * np.arange(count, dtype=np.int32), dtype=wp.int32, device=DEVICE)
-        out = [wp.full(2 * count + 2, -7, dtype=t, device=DEVICE) for t in (wp.int32, wp.float32, wp.vec2, wp.int32)]
-        bounds = wp.full(2 * count + 2, FAR, dtype=wp.float32, device=DEVICE)
-        inputs = [triangles_below(bvh, 0), slots, vectors(origin), vectors(direction), bounds]
-        wp.launch(stream_kernel, dim=1, inputs=inputs, outputs=out, device=DEVICE)
-        primitive, blocked = out[0].numpy(), out[3].numpy()
+        slots = 2 * np.arange(count)
+        out = launch(stream_kernel, triangles_below(bvh, 0), origin, direction, slots=slots, fill=-7)
+        primitive, blocked = out.primitive, out.blocked
         assert (primitive[: 2 * count : 2] == expected.primitive[: 2 * count : 2]).all()
         assert (blocked[: 2 * count : 2] == expected.blocked[: 2 * count : 2]).all()
-        assert all((a.numpy()[1::2] == -7).all() and (a.numpy()[2 * count :] == -7).all() for a in out)
+        assert all((a[1::2] == -7).all() and (a[2 * count :] == -7).all() for a in vars(out).values())

@@ -1,8 +1,7 @@
 """Rays traced against a hierarchy in both ways, which must agree bit for bit."""
 
-from __future__ import annotations
-
 import dataclasses
+import functools
 
 import numpy as np
 import warp as wp
@@ -15,59 +14,62 @@ from wavefront.accel.stream import make_streams
 DEVICE = "cpu"
 FAR = 3.0e38  # what bounds the closest hit
 
-closest_hit, occluded = make_intersector(True, False)
-closest_stream, occluded_stream = make_streams(True, False)
+
+@functools.cache
+def make_kernels(triangles: bool = True, spheres: bool = False, instances: tuple[str, ...] = ()):
+    """The portable kernel, a thread a ray, and that of a stream; the arguments are those of `make_intersector`."""
+    closest_hit, occluded = make_intersector(triangles, spheres, instances)
+    closest_stream, occluded_stream = make_streams(triangles, spheres, instances)
+    instanced = bool(instances)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def portable(
+        geometry: Geometry,
+        origin: wp.array[wp.vec3],
+        direction: wp.array[wp.vec3],
+        t_max: wp.array[wp.float32],
+        # out
+        hits: RayHits,
+        blocked: wp.array[wp.int32],
+    ):
+        i = wp.tid()
+        hit = closest_hit(geometry, origin[i], direction[i])
+        hits.primitive[i] = hit.primitive
+        hits.t[i] = hit.t
+        hits.uv[i] = wp.vec2(hit.u, hit.v)
+        if wp.static(instanced):
+            hits.instance[i] = hit.instance
+        blocked[i] = wp.where(occluded(geometry, origin[i], direction[i], t_max[i]), 1, 0)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def stream(
+        geometry: Geometry,
+        slots: wp.array[wp.int32],
+        origin: wp.array[wp.vec3],
+        direction: wp.array[wp.vec3],
+        t_max: wp.array[wp.float32],
+        # out
+        hits: RayHits,
+        blocked: wp.array[wp.int32],
+    ):
+        closest_stream(geometry, slots, slots.shape[0], origin, direction, hits)
+        occluded_stream(geometry, slots, slots.shape[0], origin, direction, t_max, blocked)
+
+    return portable, stream
 
 
-@wp.kernel(enable_backward=False, module="unique")
-def portable_kernel(
-    geometry: Geometry,
-    origin: wp.array[wp.vec3],
-    direction: wp.array[wp.vec3],
-    t_max: wp.array[wp.float32],
-    # out
-    primitive: wp.array[wp.int32],
-    t: wp.array[wp.float32],
-    uv: wp.array[wp.vec2],
-    blocked: wp.array[wp.int32],
-):
-    i = wp.tid()
-    hit = closest_hit(geometry, origin[i], direction[i])
-    primitive[i] = hit.primitive
-    t[i] = hit.t
-    uv[i] = wp.vec2(hit.u, hit.v)
-    blocked[i] = wp.where(occluded(geometry, origin[i], direction[i], t_max[i]), 1, 0)
-
-
-@wp.kernel(enable_backward=False, module="unique")
-def stream_kernel(
-    geometry: Geometry,
-    slots: wp.array[wp.int32],
-    origin: wp.array[wp.vec3],
-    direction: wp.array[wp.vec3],
-    t_max: wp.array[wp.float32],
-    # out
-    primitive: wp.array[wp.int32],
-    t: wp.array[wp.float32],
-    uv: wp.array[wp.vec2],
-    blocked: wp.array[wp.int32],
-):
-    hits = RayHits()
-    hits.primitive = primitive
-    hits.t = t
-    hits.uv = uv
-    closest_stream(geometry, slots, slots.shape[0], origin, direction, hits)
-    occluded_stream(geometry, slots, slots.shape[0], origin, direction, t_max, blocked)
+portable_kernel, stream_kernel = make_kernels()
 
 
 @dataclasses.dataclass
 class Hits:
-    """Arrays of N: number of the first triangle (-1: none), distance, weights of vertices 0 and 1 [N, 2], and whether
-    any triangle lies before `t_max`."""
+    """Arrays of N: number of the first primitive (-1: none), distance, weights of vertices 0 and 1 [N, 2], instance
+    (zeros without instances), and whether anything lies before `t_max`."""
 
     primitive: np.ndarray
     t: np.ndarray
     uv: np.ndarray
+    instance: np.ndarray
     blocked: np.ndarray
 
 
@@ -88,23 +90,29 @@ def triangles_below(bvh: Bvh, root: int) -> Geometry:
     return geometry
 
 
-def trace(kernel, bvh: Bvh, root: int, origin, direction, t_max=None) -> Hits:
-    """What one of both kernels finds; the stream takes its rays in a mixed order."""
+def launch(kernel, geometry: Geometry, origin, direction, t_max=None, slots=None, fill: int = 0) -> Hits:
+    """What one of a pair of kernels finds; a stream takes its rays in a mixed order, or those of `slots`.
+
+    Args:
+        fill: What is in the arrays before.
+    """
     n = len(origin)
     t_max = wp.array(np.full(n, FAR) if t_max is None else t_max, dtype=wp.float32, device=DEVICE)
     queue, dim = [], n
-    if kernel is stream_kernel:
-        queue = [wp.array(np.random.default_rng(1).permutation(n).astype(np.int32), device=DEVICE)]
-        dim = 1
-    out = [wp.zeros(n, dtype=t, device=DEVICE) for t in (wp.int32, wp.float32, wp.vec2, wp.int32)]
-    inputs = [triangles_below(bvh, root), *queue, vectors(origin), vectors(direction), t_max]
-    wp.launch(kernel, dim=dim, inputs=inputs, outputs=out, device=DEVICE)
-    return Hits(*(a.numpy() for a in out))
+    if "slots" in kernel.adj.arg_types:
+        slots = np.random.default_rng(1).permutation(n) if slots is None else slots
+        queue, dim = [wp.array(slots, dtype=wp.int32, device=DEVICE)], 1
+    hits, blocked = RayHits(), wp.full(n, fill, dtype=wp.int32, device=DEVICE)
+    for name, variable in RayHits.vars.items():
+        setattr(hits, name, wp.full(n, fill, dtype=variable.type.dtype, device=DEVICE))
+    inputs = [geometry, *queue, vectors(origin), vectors(direction), t_max]
+    wp.launch(kernel, dim=dim, inputs=inputs, outputs=[hits, blocked], device=DEVICE)
+    return Hits(*(getattr(hits, name).numpy() for name in RayHits.vars), blocked.numpy())
 
 
-def trace_both(bvh: Bvh, root: int, origin, direction, t_max=None) -> Hits:
-    """Asserts that both kernels find the same bits."""
-    hits, others = (trace(kernel, bvh, root, origin, direction, t_max) for kernel in (portable_kernel, stream_kernel))
+def compare(kernels, geometry: Geometry, origin, direction, t_max=None) -> Hits:
+    """Asserts that both of a pair of kernels find the same bits."""
+    hits, others = (launch(kernel, geometry, origin, direction, t_max) for kernel in kernels)
     for field in dataclasses.fields(Hits):
         a, b = (getattr(h, field.name) for h in (hits, others))
         assert a.dtype == b.dtype
@@ -113,12 +121,26 @@ def trace_both(bvh: Bvh, root: int, origin, direction, t_max=None) -> Hits:
     return hits
 
 
+def trace(kernel, bvh: Bvh, root: int, origin, direction, t_max=None) -> Hits:
+    """What one of both kernels finds among the triangles of one hierarchy."""
+    return launch(kernel, triangles_below(bvh, root), origin, direction, t_max)
+
+
+def trace_both(bvh: Bvh, root: int, origin, direction, t_max=None) -> Hits:
+    """Asserts that both kernels find the same bits among them."""
+    return compare(make_kernels(), triangles_below(bvh, root), origin, direction, t_max)
+
+
 def check_any(bvh: Bvh, root: int, origin, direction, closest: Hits) -> None:
+    check_bounds(make_kernels(), triangles_below(bvh, root), origin, direction, closest)
+
+
+def check_bounds(kernels, geometry: Geometry, origin, direction, closest: Hits) -> None:
     """Asserts that any-hit with bounds on either side of the closest hit agrees with it to the last bit."""
     hit, t = closest.primitive >= 0, closest.t
     none = np.zeros(len(hit), bool)
-    # The end is left out, and so is what lies behind; a stream of closest hits ends at `FAR`.
+    # The end is left out, and so is what lies behind; closest hits end at `FAR`.
     further = np.where(hit, np.minimum(np.float32(1.5) * np.minimum(t, 2e38), FAR), 1.0)
     for bound, blocked in ((t, none), (0.5 * t, none), (further, hit), (np.nextafter(t, np.float32(np.inf)), hit)):
-        wrong = (trace_both(bvh, root, origin, direction, bound).blocked != 0) != blocked
+        wrong = (compare(kernels, geometry, origin, direction, bound).blocked != 0) != blocked
         assert not wrong.any(), (np.flatnonzero(wrong)[:5], wrong.sum())

@@ -236,7 +236,7 @@ class _Upload:
                 part.enclose(boxes)
         bounds = parts[0].bounds
         if len(parts) > 1:
-            lower, upper = self.instances.boxes(parts[1:])
+            lower, upper = self.instances.boxes(parts[1:], bounds)
             add_boxes(geometry, "instance_root", (lower, upper))
             bounds = np.array([np.minimum(bounds[0], lower.min(axis=0)), np.maximum(bounds[1], upper.max(axis=0))])
         if hierarchies:

@@ -51,20 +51,25 @@ class InstanceUpload:
         matrices = [to_matrix(item.to_world, f"instances[{i}].to_world") for i, item in enumerate(scene.instances)]
         self.matrices = np.array(matrices).reshape(-1, 4, 4)
 
-    def boxes(self, parts: list[Part]) -> tuple[np.ndarray, np.ndarray]:
+    def boxes(self, parts: list[Part], own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corners of the box of each instance, [N, 3] float32.
+
+        They are grown by the roundings of a ray from anywhere in the scene on its way to local space, so that what it
+        meets there lies in the box. With M = `to_world`, these are some units in the last place of |M^-1| times the way
+        of the ray from the translation, component by component, and in the world |M| times that.
 
         Args:
             parts: Of each group.
+            own: Bounds of the scene's own shapes, [2, 3]; infinite and inside out if there are none.
         """
         bounds = np.array([part.bounds for part in parts])[self.group_of]
-        linear, translation = np.abs(self.matrices[:, :3, :3]), self.matrices[:, :3, 3]
-        center = np.einsum("nij,nj->ni", self.matrices[:, :3, :3], bounds.mean(axis=1)) + translation
-        half = np.einsum("nij,nj->ni", linear, 0.5 * (bounds[:, 1] - bounds[:, 0]))
-        # Grown by the roundings of a ray on its way to local space, so that no side cuts off what is inside.
-        half += float(POSITION_ERROR) * (
-            np.einsum("nij,nj->ni", linear, np.abs(bounds).max(axis=1)) + np.abs(translation)
-        )
+        linear, translation = self.matrices[:, :3, :3], self.matrices[:, :3, 3]
+        spread = np.abs(linear) @ np.abs(np.linalg.inv(linear))
+        center = np.einsum("nij,nj->ni", linear, bounds.mean(axis=1)) + translation
+        half = np.einsum("nij,nj->ni", np.abs(linear), 0.5 * (bounds[:, 1] - bounds[:, 0]))
+        way = np.einsum("nij,nj->ni", np.abs(linear), np.abs(bounds).max(axis=1))
+        way += np.maximum((center + half).max(axis=0), own[1]) - np.minimum((center - half).min(axis=0), own[0])
+        half += float(POSITION_ERROR) * (np.einsum("nij,nj->ni", spread, way) + np.abs(translation))
         return tuple((center + sign * half).astype(np.float32) for sign in (-1.0, 1.0))
 
     def upload(self, geometry: Geometry, parts: list[Part]) -> None:
