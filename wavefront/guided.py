@@ -157,7 +157,7 @@ class GuidedWorker(Worker):
             self.bound = min(int(self.queues.counters[queues.RAYS : queues.RAYS + 1].numpy()[0]), self.capacity)
         if self.recording:
             self._launch("put_aside", "rays")
-        self._launch("stream", min(1, self._threads("rays")))
+        self._launch("stream", "rays")
         self._launch("intersect", "rays")
         self._launch("perturb", "rays")
         if self.recording:
@@ -176,7 +176,7 @@ class GuidedWorker(Worker):
         if self.guide.has_pdf and "light" in self.commands:
             self._ask("evaluate", "lit", self.light_proposals.wi, self.light_proposals.guide_pdf, LIGHTS)
         self._launch("light", "lit")
-        self._launch("stream_shadow", min(1, self._threads("shadow")))
+        self._launch("stream_shadow", "shadow")
         if self.recording:
             self._launch("record_shadow", "shadow")
             self._launch("record_light", "shadow")

@@ -323,26 +323,29 @@ class Worker:
         self._launch("accumulate", pixels)
 
     def _bounce(self, aov_pixels: int = 0) -> None:
-        self._launch("stream", min(1, self._threads("rays")))
+        self._launch("stream", "rays")
         self._launch("intersect", "rays")
         self._launch("perturb", "rays")
         self._launch("escaped", "escaped")
         self._launch("emission", "emissive")
         self._launch("aov", aov_pixels)
         self._launch("direct", "hits")
-        self._launch("stream_shadow", min(1, self._threads("shadow")))
+        self._launch("stream_shadow", "shadow")
         self._launch("shadow", "shadow")
         self._launch("drain", 1)
         self._launch("scatter", "hits")
         self._launch("advance", 1)
 
     def _launch(self, stage: str, size: str | int) -> None:
-        """Launches a stage over a queue, or over a number of threads; on the CPU device no more than is queued."""
+        """Launches a stage over a queue, or over a number of threads.
+
+        On the CPU device one thread takes a whole queue, see `queues.queue_end`, and none an empty one.
+        """
         command = self.commands.get(stage)
         if command is None:
             return
         if isinstance(size, str):
-            size = self._threads(size)
+            size = min(self._threads(size), 1) if self.device == "cpu" else self._threads(size)
         if size == 0:
             return
         command.set_dim(min(size, self.capacity))

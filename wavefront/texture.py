@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from wavefront.film import LUMINANCE
+from wavefront.finite import is_finite
 
 KIND_CHECKERBOARD = wp.constant(0)
 KIND_BYTES = wp.constant(1)
@@ -180,7 +181,7 @@ def make_eval_texture(kinds: tuple[str, ...]):
     def eval_texture(tables: TextureTables, texture: int, surface_uv: wp.vec2) -> wp.vec3:
         record = tables.records[texture]
         uv = texture_uv(record, surface_uv)
-        if not wp.isfinite(uv[0] + uv[1]):
+        if not is_finite(uv[0] + uv[1]):
             return wp.vec3(0.0)
         if wp.static(has_checkerboard):
             if record.kind == KIND_CHECKERBOARD:
@@ -224,7 +225,7 @@ def make_eval_gradient(kinds: tuple[str, ...]):
     def eval_gradient(tables: TextureTables, texture: int, surface_uv: wp.vec2) -> wp.vec2:
         record = tables.records[texture]
         uv = texture_uv(record, surface_uv)
-        if record.kind == KIND_CHECKERBOARD or not wp.isfinite(uv[0] + uv[1]):
+        if record.kind == KIND_CHECKERBOARD or not is_finite(uv[0] + uv[1]):
             return wp.vec2(0.0)
         position = pixel_position(record, uv) - wp.vec2(0.5)
         x = int(wp.floor(position[0]))

@@ -11,7 +11,7 @@ from wavefront.bsdf.dispatch import make_bsdf
 from wavefront.bsdf.frame import make_frame
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.proposals import TECHNIQUE_BSDF, TECHNIQUE_GUIDE, Proposals, make_bsdf_share
-from wavefront.queues import DEPTH, Paths, Queue, Surfaces, push, queue_size
+from wavefront.queues import DEPTH, Paths, Queue, Surfaces, push, queue_end, slot_at
 from wavefront.rng import PURPOSE_BSDF, PURPOSE_TECHNIQUE
 from wavefront.sampler import SAMPLERS
 from wavefront.stage_kernel import stage_kernel
@@ -51,41 +51,39 @@ def make_guided_propose(
         smooth: Queue,  # directions for which the guide's density is needed
         counters: wp.array[wp.int32],
     ):
-        i = wp.tid()
-        if i >= queue_size(hits):
-            return
-        slot = hits.slots[i]
-        pixel = paths.pixel[slot]
-        sample = paths.sample[slot]
-        depth = counters[DEPTH]
-        share = bsdf_share(proposals, slot)
-        if share < 1.0:
-            choice = draw(seed, pixel, sample, depth, PURPOSE_TECHNIQUE)
-            if choice[0] >= share:
-                proposals.technique[slot] = TECHNIQUE_GUIDE
-                push(proposed, slot, counters)
+        for i in range(wp.tid(), queue_end(hits, wp.tid())):
+            slot = slot_at(hits, i)
+            pixel = paths.pixel[slot]
+            sample = paths.sample[slot]
+            depth = counters[DEPTH]
+            share = bsdf_share(proposals, slot)
+            if share < 1.0:
+                choice = draw(seed, pixel, sample, depth, PURPOSE_TECHNIQUE)
+                if choice[0] >= share:
+                    proposals.technique[slot] = TECHNIQUE_GUIDE
+                    push(proposed, slot, counters)
+                    push(smooth, slot, counters)
+                    continue
+            u = draw(seed, pixel, sample, depth, PURPOSE_BSDF)
+            uv = wp.vec2(0.0)
+            if wp.static(uvs):
+                uv = surfaces.uv[slot]
+            bsdf = sample_bsdf(
+                materials,
+                textures,
+                surfaces.material[slot],
+                uv,
+                frame_at(surfaces, slot),
+                -paths.direction[slot],
+                wp.vec3(u[0], u[1], u[2]),
+            )
+            proposals.technique[slot] = TECHNIQUE_BSDF
+            proposals.wi[slot] = wp.normalize(bsdf.wi)
+            proposals.weight[slot] = bsdf.weight
+            proposals.bsdf_pdf[slot] = bsdf.pdf
+            if wp.static(transmission):
+                proposals.eta[slot] = bsdf.eta
+            if share < 1.0 and bsdf.pdf > 0.0:
                 push(smooth, slot, counters)
-                return
-        u = draw(seed, pixel, sample, depth, PURPOSE_BSDF)
-        uv = wp.vec2(0.0)
-        if wp.static(uvs):
-            uv = surfaces.uv[slot]
-        bsdf = sample_bsdf(
-            materials,
-            textures,
-            surfaces.material[slot],
-            uv,
-            frame_at(surfaces, slot),
-            -paths.direction[slot],
-            wp.vec3(u[0], u[1], u[2]),
-        )
-        proposals.technique[slot] = TECHNIQUE_BSDF
-        proposals.wi[slot] = wp.normalize(bsdf.wi)
-        proposals.weight[slot] = bsdf.weight
-        proposals.bsdf_pdf[slot] = bsdf.pdf
-        if wp.static(transmission):
-            proposals.eta[slot] = bsdf.eta
-        if share < 1.0 and bsdf.pdf > 0.0:
-            push(smooth, slot, counters)
 
     return propose_directions
