@@ -18,6 +18,7 @@ class Features:
     spheres: bool
     instances: tuple[str, ...]  # kinds of primitive in groups that have instances, sorted; empty without instances
     accel: str  # how rays find triangles, one of `accel.intersector.ACCELS`
+    ahead: bool  # what vertices are made of and their textures are fetched ahead, see `stages.ahead`
     streams: bool  # rays are traced against the scene's own triangles by queues, see `accel.stream`
     smooth: bool  # some mesh has vertex normals
     uvs: bool  # some texture is looked up, or UVs are asked for

@@ -36,14 +36,14 @@ def make_guided_kernels(f: Features) -> dict[str, wp.Kernel]:
     frame = f.uvs, f.tangents, f.maps
     kernels = {
         "vertices": make_guided_vertices(*bsdf, f.uvs, f.mixed_deltas, f.guide_inputs),
-        "propose": make_guided_propose(*bsdf, *frame, f.transmission, f.sampler, f.mixed_deltas),
+        "propose": make_guided_propose(*bsdf, *frame, f.transmission, f.sampler, f.mixed_deltas, f.ahead),
         "directions": make_guided_evaluate(*bsdf, *frame, f.transmission),
         "resolve": make_guided_resolve(
             f.transmission, f.roulette, f.media, f.sampler, f.mixed_deltas, f.guide_pdf, f.records
         ),
     }
     if f.light_sampling:
-        kernels["direct"] = make_guided_direct(*bsdf, f.lights, f.light_textures, *frame, f.media, f.sampler)
+        kernels["direct"] = make_guided_direct(*bsdf, f.lights, f.light_textures, *frame, f.media, f.sampler, f.ahead)
         kernels["light"] = make_guided_light(f.mixed_deltas, f.guide_pdf, bool(f.records))
     if f.records:
         kernels["put_aside"] = put_throughput_aside

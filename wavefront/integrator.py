@@ -56,6 +56,7 @@ def make_features(scene: description.Scene, device_scene: DeviceScene, guide: Gu
         instances=device_scene.instances,
         accel=device_scene.accel,
         streams=device_scene.streams and device_scene.geometry.root >= 0,
+        ahead=device_scene.ahead,
         smooth=device_scene.smooth,
         uvs=bool(device_scene.texture_kinds) or "uv" in scene.film.aovs,
         tangents=device_scene.tangents,
@@ -124,13 +125,24 @@ def make_kernels(f: Features) -> Kernels:
             f.instances,
             f.accel,
             f.streams,
+            f.ahead,
         ),
         perturb=make_perturb(f.textures, f.uvs, "bump" in f.maps) if f.maps else None,
         escaped=make_escaped(f.escape_lights, f.light_sampling) if f.escape_lights else None,
         emission=make_emission(f.lights, f.light_textures, f.light_sampling) if f.area_lights else None,
         aov=make_aov(f.aovs, f.bsdfs, f.mask, f.textures, f.uvs) if f.aovs else None,
         direct=make_direct(
-            f.bsdfs, f.mask, f.textures, f.lights, f.light_textures, f.uvs, f.tangents, f.maps, f.media, f.sampler
+            f.bsdfs,
+            f.mask,
+            f.textures,
+            f.lights,
+            f.light_textures,
+            f.uvs,
+            f.tangents,
+            f.maps,
+            f.media,
+            f.sampler,
+            f.ahead,
         )
         if f.light_sampling and not f.guided
         else None,
@@ -138,7 +150,17 @@ def make_kernels(f: Features) -> Kernels:
         shadow=make_shadow(f.triangles, f.spheres, f.instances, f.accel, f.streams) if f.light_sampling else None,
         drain=drain_rays,
         scatter=make_scatter(
-            f.bsdfs, f.mask, f.textures, f.uvs, f.tangents, f.maps, f.transmission, f.roulette, f.media, f.sampler
+            f.bsdfs,
+            f.mask,
+            f.textures,
+            f.uvs,
+            f.tangents,
+            f.maps,
+            f.transmission,
+            f.roulette,
+            f.media,
+            f.sampler,
+            f.ahead,
         )
         if not f.guided
         else None,

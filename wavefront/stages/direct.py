@@ -14,6 +14,7 @@ from wavefront.light.mis import power_heuristic
 from wavefront.light.tables import DELTA, LightTables
 from wavefront.queues import DEPTH, NONFINITE_DIRECT, Paths, Queue, ShadowRays, Surfaces, push, queue_end, slot_at
 from wavefront.stage_kernel import stage_kernel
+from wavefront.stages.ahead import make_fetch_textures
 from wavefront.stages.light_proposal import make_light_proposal
 from wavefront.texture import TextureTables
 
@@ -30,12 +31,15 @@ def make_direct(
     maps: tuple[str, ...],
     media: bool = False,
     sampler: str = "independent",
+    ahead: bool = False,
 ):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
     propose_light, aim_shadow_ray = make_light_proposal(
         bsdfs, mask, textures, lights, light_textures, uvs, tangents, maps, media, sampler
     )
     extended = any(kind not in DELTA for kind in lights)
+
+    fetch_textures = make_fetch_textures(textures, uvs, ahead)
 
     @stage_kernel
     def sample_direct_light(
@@ -53,6 +57,7 @@ def make_direct(
         counters: wp.array[wp.int32],
     ):
         for i in range(wp.tid(), queue_end(hits, wp.tid())):
+            fetch_textures(materials, textures, surfaces, hits, i)
             slot = slot_at(hits, i)
             cos_o = -wp.dot(surfaces.shading_normal[slot], paths.direction[slot])
             if not is_smooth(materials.materials[surfaces.material[slot]], cos_o):

@@ -15,6 +15,7 @@ from wavefront.light.tables import LightTables
 from wavefront.proposals import LightProposals
 from wavefront.queues import DEPTH, Paths, Queue, ShadowRays, Surfaces, push, queue_end, slot_at
 from wavefront.stage_kernel import stage_kernel
+from wavefront.stages.ahead import make_fetch_textures
 from wavefront.stages.light_proposal import make_light_proposal
 from wavefront.texture import TextureTables
 
@@ -31,11 +32,13 @@ def make_guided_direct(
     maps: tuple[str, ...],
     media: bool,
     sampler: str,
+    ahead: bool,
 ):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
     propose_light, aim_shadow_ray = make_light_proposal(
         bsdfs, mask, textures, lights, light_textures, uvs, tangents, maps, media, sampler
     )
+    fetch_textures = make_fetch_textures(textures, uvs, ahead)
 
     @stage_kernel
     def propose_direct_light(
@@ -54,6 +57,7 @@ def make_guided_direct(
         counters: wp.array[wp.int32],
     ):
         for i in range(wp.tid(), queue_end(guided, wp.tid())):
+            fetch_textures(materials, textures, surfaces, guided, i)
             slot = slot_at(guided, i)
             proposal = propose_light(
                 geometry, materials, textures, lights, paths, surfaces, slot, seed, counters[DEPTH]

@@ -15,6 +15,7 @@ from wavefront.queues import DEPTH, Paths, Queue, Surfaces, push, queue_end, slo
 from wavefront.rng import PURPOSE_BSDF, PURPOSE_TECHNIQUE
 from wavefront.sampler import SAMPLERS
 from wavefront.stage_kernel import stage_kernel
+from wavefront.stages.ahead import make_fetch_textures
 from wavefront.texture import TextureTables
 
 
@@ -29,12 +30,14 @@ def make_guided_propose(
     transmission: bool,
     sampler: str,
     mixed_deltas: bool,
+    ahead: bool,
 ):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
     _, sample_bsdf, _ = make_bsdf(bsdfs, mask, textures, tangents, bool(maps))
     frame_at, _ = make_frame(tangents, bool(maps))
     draw = SAMPLERS[sampler]
     bsdf_share = make_bsdf_share(mixed_deltas)
+    fetch_textures = make_fetch_textures(textures, uvs, ahead)
 
     @stage_kernel
     def propose_directions(
@@ -52,6 +55,7 @@ def make_guided_propose(
         counters: wp.array[wp.int32],
     ):
         for i in range(wp.tid(), queue_end(hits, wp.tid())):
+            fetch_textures(materials, textures, surfaces, hits, i)
             slot = slot_at(hits, i)
             pixel = paths.pixel[slot]
             sample = paths.sample[slot]

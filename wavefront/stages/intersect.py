@@ -11,6 +11,7 @@ from wavefront.accel.intersector import make_intersector
 from wavefront.medium import transmittance
 from wavefront.queues import DEPTH, Paths, Queue, Surfaces, TriangleHits, push, queue_end, slot_at
 from wavefront.stage_kernel import stage_kernel
+from wavefront.stages.ahead import make_fetch_triangles
 from wavefront.surface import make_vertex
 
 
@@ -29,6 +30,7 @@ def make_intersect(
     instances: tuple[str, ...] = (),
     accel: str = "bvh",
     streams: bool = False,
+    ahead: bool = False,
 ):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name (or whether there are any).
 
@@ -38,6 +40,7 @@ def make_intersect(
     closest_hit, closest_other, AnyHit = intersector.closest_hit, intersector.closest_other, hit_type(instances)
     traced = triangles and streams
     vertex_of = make_vertex(triangles, spheres, smooth, uvs, tangents, bumps, instances)
+    fetch_triangles = make_fetch_triangles(smooth, uvs, ahead)
 
     @stage_kernel
     def closest_hits(
@@ -54,6 +57,8 @@ def make_intersect(
         counters: wp.array[wp.int32],
     ):
         for i in range(wp.tid(), queue_end(rays, wp.tid())):
+            if wp.static(traced):
+                fetch_triangles(geometry, triangle_hits, rays, i)
             slot = slot_at(rays, i)
             origin = paths.origin[slot]
             direction = paths.direction[slot]

@@ -15,6 +15,7 @@ from wavefront.queues import DEPTH, NONFINITE_SCATTER, Paths, Queue, Surfaces, p
 from wavefront.rng import PURPOSE_BSDF
 from wavefront.sampler import SAMPLERS
 from wavefront.stage_kernel import stage_kernel
+from wavefront.stages.ahead import make_fetch_textures
 from wavefront.surface import spawn_origin
 from wavefront.texture import TextureTables
 
@@ -38,11 +39,14 @@ def make_scatter(
     roulette: bool,
     media: bool = False,
     sampler: str = "independent",
+    ahead: bool = False,
 ):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
     _, sample_bsdf, _ = make_bsdf(bsdfs, mask, textures, tangents, bool(maps))
     frame_at, _ = make_frame(tangents, bool(maps))
     draw = SAMPLERS[sampler]
+
+    fetch_textures = make_fetch_textures(textures, uvs, ahead)
 
     @stage_kernel
     def scatter_paths(
@@ -59,6 +63,7 @@ def make_scatter(
         counters: wp.array[wp.int32],
     ):
         for i in range(wp.tid(), queue_end(hits, wp.tid())):
+            fetch_textures(materials, textures, surfaces, hits, i)
             slot = slot_at(hits, i)
             depth = counters[DEPTH]
 
