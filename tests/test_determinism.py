@@ -9,6 +9,7 @@ import warp as wp
 
 from wavefront import Renderer, load_scene
 from wavefront.integrator import plan_tiles
+from wavefront.scene import device
 
 SCENES = Path(__file__).parent.parent / "scenes"
 SPP = 8
@@ -62,6 +63,14 @@ def test_capacity_of_a_whole_pass(name, reference):
     r = Renderer(load(name), threads=1, seed=5, paths_in_flight=1 << 16)
     assert r.capacity == 1 << 16
     assert len(plan_tiles(61, 47, r.capacity, 0, SPP)) == 1
+    np.testing.assert_array_equal(film(r), reference)
+
+
+def test_fetching_ahead(name, reference, monkeypatch):
+    """As for scenes that fit no cache; of the queues of a small capacity, the last entries have none after them."""
+    monkeypatch.setattr(device, "CACHE_BYTES", 0)
+    r = Renderer(load(name), threads=1, seed=5, paths_in_flight=1024)
+    assert r.features.ahead
     np.testing.assert_array_equal(film(r), reference)
 
 

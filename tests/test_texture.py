@@ -12,11 +12,13 @@ from wavefront.texture import (
     TextureTables,
     make_eval_gradient,
     make_eval_texture,
+    make_prefetch_texture,
     srgb_to_linear,
 )
 
 DEVICE = "cpu"
 eval_texture = make_eval_texture(tuple(sorted(KINDS)))
+prefetch_texture = make_prefetch_texture(tuple(sorted(KINDS)))
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -28,6 +30,7 @@ def texture_kernel(
     values: wp.array(dtype=wp.vec3),
 ):
     i = wp.tid()
+    prefetch_texture(tables, texture, uv[i])  # may change nothing, whatever the coordinates
     values[i] = eval_texture(tables, texture, uv[i])
 
 

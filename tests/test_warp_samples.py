@@ -173,6 +173,28 @@ def test_ends_of_the_unit_interval(kind, parameter):
         assert np.all(x[:, 0] + x[:, 1] <= 1.0 + 1e-7)
 
 
+@wp.kernel(enable_backward=False, module="unique")
+def circle_kernel(u: wp.array(dtype=float), result: wp.array(dtype=wp.vec2)):
+    i = wp.tid()
+    result[i] = ws.unit_circle(u[i])
+
+
+def test_unit_circle():
+    """Against float64; the quarters are exact, and small sines keep their relative precision."""
+    u = np.concatenate([np.linspace(0.0, 1.0, 1 << 16), np.arange(9) / 8.0, 10.0 ** np.linspace(-40.0, 0.0, 1000)])
+    u = u.astype(np.float32)
+    result = wp.zeros(len(u), dtype=wp.vec2, device=DEVICE)
+    wp.launch(circle_kernel, dim=len(u), inputs=[wp.array(u, device=DEVICE)], outputs=[result], device=DEVICE)
+    angle = 2.0 * np.pi * u.astype(np.float64)
+    found = result.numpy().astype(np.float64)
+    np.testing.assert_allclose(found, np.stack([np.cos(angle), np.sin(angle)], axis=1), rtol=0.0, atol=1.0e-7)
+    small = (u > 1e-37) & (u < 0.1)
+    np.testing.assert_allclose(found[small, 1], np.sin(angle[small]), rtol=2.0e-7)
+    quarters = np.float32([0.0, 0.25, 0.5, 0.75, 1.0])
+    exact = found[np.searchsorted(u[1 << 16 : (1 << 16) + 9], quarters) + (1 << 16)]
+    np.testing.assert_array_equal(exact, [[1, 0], [0, 1], [-1, 0], [0, -1], [1, 0]])
+
+
 def test_tiny_cone_spreads_over_its_disk():
     """At 1e-6 rad the sine is the angle: its square is uniform up to 2 (1 - cos)."""
     x = apply_map(CONE, uniforms(5), TINY_CONE)

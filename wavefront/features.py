@@ -19,6 +19,7 @@ class Features:
     instances: tuple[str, ...]  # kinds of primitive in groups that have instances, sorted; empty without instances
     accel: str  # how rays find triangles, one of `accel.intersector.ACCELS`
     streams: bool  # rays are traced by queues, see `accel.stream`
+    ahead: bool  # what vertices are made of and their textures are fetched ahead, see `stages.ahead`
     smooth: bool  # some mesh has vertex normals
     uvs: bool  # some texture is looked up, or UVs are asked for
     tangents: bool  # some BSDF depends on the direction of its tangent

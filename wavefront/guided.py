@@ -36,14 +36,14 @@ def make_guided_kernels(f: Features) -> dict[str, wp.Kernel]:
     frame = f.uvs, f.tangents, f.maps
     kernels = {
         "vertices": make_guided_vertices(*bsdf, f.uvs, f.mixed_deltas, f.guide_inputs),
-        "propose": make_guided_propose(*bsdf, *frame, f.transmission, f.sampler, f.mixed_deltas),
+        "propose": make_guided_propose(*bsdf, *frame, f.transmission, f.sampler, f.mixed_deltas, f.ahead),
         "directions": make_guided_evaluate(*bsdf, *frame, f.transmission),
         "resolve": make_guided_resolve(
             f.transmission, f.roulette, f.media, f.sampler, f.mixed_deltas, f.guide_pdf, f.records
         ),
     }
     if f.light_sampling:
-        kernels["direct"] = make_guided_direct(*bsdf, f.lights, f.light_textures, *frame, f.media, f.sampler)
+        kernels["direct"] = make_guided_direct(*bsdf, f.lights, f.light_textures, *frame, f.media, f.sampler, f.ahead)
         kernels["light"] = make_guided_light(f.mixed_deltas, f.guide_pdf, bool(f.records))
     if f.records:
         kernels["put_aside"] = put_throughput_aside
@@ -157,7 +157,7 @@ class GuidedWorker(Worker):
             self.bound = min(int(self.queues.counters[queues.RAYS : queues.RAYS + 1].numpy()[0]), self.capacity)
         if self.recording:
             self._launch("put_aside", "rays")
-        self._launch("stream", min(1, self._threads("rays")))
+        self._launch("stream", "rays")
         self._launch("intersect", "rays")
         self._launch("perturb", "rays")
         if self.recording:
@@ -176,7 +176,7 @@ class GuidedWorker(Worker):
         if self.guide.has_pdf and "light" in self.commands:
             self._ask("evaluate", "lit", self.light_proposals.wi, self.light_proposals.guide_pdf, LIGHTS)
         self._launch("light", "lit")
-        self._launch("stream_shadow", min(1, self._threads("shadow")))
+        self._launch("stream_shadow", "shadow")
         if self.recording:
             self._launch("record_shadow", "shadow")
             self._launch("record_light", "shadow")

@@ -57,6 +57,7 @@ def make_features(scene: description.Scene, device_scene: DeviceScene, guide: Gu
         instances=device_scene.instances,
         accel=device_scene.accel,
         streams=device_scene.streams,
+        ahead=device_scene.ahead,
         smooth=device_scene.smooth,
         uvs=bool(device_scene.texture_kinds) or "uv" in scene.film.aovs,
         tangents=device_scene.tangents,
@@ -125,13 +126,24 @@ def make_kernels(f: Features) -> Kernels:
             f.instances,
             f.accel,
             f.streams,
+            f.ahead,
         ),
         perturb=make_perturb(f.textures, f.uvs, "bump" in f.maps) if f.maps else None,
         escaped=make_escaped(f.escape_lights, f.light_sampling) if f.escape_lights else None,
         emission=make_emission(f.lights, f.light_textures, f.light_sampling) if f.area_lights else None,
         aov=make_aov(f.aovs, f.bsdfs, f.mask, f.textures, f.uvs) if f.aovs else None,
         direct=make_direct(
-            f.bsdfs, f.mask, f.textures, f.lights, f.light_textures, f.uvs, f.tangents, f.maps, f.media, f.sampler
+            f.bsdfs,
+            f.mask,
+            f.textures,
+            f.lights,
+            f.light_textures,
+            f.uvs,
+            f.tangents,
+            f.maps,
+            f.media,
+            f.sampler,
+            f.ahead,
         )
         if f.light_sampling and not f.guided
         else None,
@@ -141,7 +153,17 @@ def make_kernels(f: Features) -> Kernels:
         shadow=make_shadow(f.triangles, f.spheres, f.instances, f.accel, f.streams) if f.light_sampling else None,
         drain=drain_rays,
         scatter=make_scatter(
-            f.bsdfs, f.mask, f.textures, f.uvs, f.tangents, f.maps, f.transmission, f.roulette, f.media, f.sampler
+            f.bsdfs,
+            f.mask,
+            f.textures,
+            f.uvs,
+            f.tangents,
+            f.maps,
+            f.transmission,
+            f.roulette,
+            f.media,
+            f.sampler,
+            f.ahead,
         )
         if not f.guided
         else None,
@@ -325,26 +347,29 @@ class Worker:
         self._launch("accumulate", pixels)
 
     def _bounce(self, aov_pixels: int = 0) -> None:
-        self._launch("stream", min(1, self._threads("rays")))
+        self._launch("stream", "rays")
         self._launch("intersect", "rays")
         self._launch("perturb", "rays")
         self._launch("escaped", "escaped")
         self._launch("emission", "emissive")
         self._launch("aov", aov_pixels)
         self._launch("direct", "hits")
-        self._launch("stream_shadow", min(1, self._threads("shadow")))
+        self._launch("stream_shadow", "shadow")
         self._launch("shadow", "shadow")
         self._launch("drain", 1)
         self._launch("scatter", "hits")
         self._launch("advance", 1)
 
     def _launch(self, stage: str, size: str | int) -> None:
-        """Launches a stage over a queue, or over a number of threads; on the CPU device no more than is queued."""
+        """Launches a stage over a queue, or over a number of threads.
+
+        On the CPU device one thread takes a whole queue, see `queues.queue_end`, and none an empty one.
+        """
         command = self.commands.get(stage)
         if command is None:
             return
         if isinstance(size, str):
-            size = self._threads(size)
+            size = min(self._threads(size), 1) if self.device == "cpu" else self._threads(size)
         if size == 0:
             return
         command.set_dim(min(size, self.capacity))

@@ -62,6 +62,32 @@ def queue_size(queue: Queue) -> int:
     return wp.min(queue.count[0], queue.slots.shape[0])
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return thread < size ? thread + 1 : thread;
+#else
+    return thread == 0 ? size : thread;
+#endif
+""")
+def end_of_share(size: int, thread: int) -> int: ...
+
+
+@wp.func
+def queue_end(queue: Queue, thread: int) -> int:
+    """Where the entries of a thread end that begin at the index of the thread.
+
+    On CUDA a thread takes one. On the CPU device the first takes all: what describes the arrays of a kernel's arguments
+    is then loaded once for a queue and not again for every entry, which was a tenth of the time of a render.
+    """
+    return end_of_share(queue_size(queue), thread)
+
+
+@wp.func
+def slot_at(queue: Queue, i: int) -> int:
+    """Entry `i`. Slots are not negative, and the compiler knows: an index that may be is counted from the end."""
+    return queue.slots[i] & 0x7FFFFFFF
+
+
 @wp.func
 def push(queue: Queue, slot: int, counters: wp.array[wp.int32]):
     index = wp.atomic_add(queue.count, 0, 1)

@@ -12,6 +12,8 @@ import numpy as np
 import warp as wp
 
 from wavefront.film import LUMINANCE
+from wavefront.finite import is_finite
+from wavefront.prefetch import make_prefetch
 
 KIND_CHECKERBOARD = wp.constant(0)
 KIND_BYTES = wp.constant(1)
@@ -165,6 +167,52 @@ def make_fetch(kinds: tuple[str, ...]):
     return fetch
 
 
+_prefetch_byte, _prefetch_short = make_prefetch(wp.uint8), make_prefetch(wp.uint16)
+_prefetch_half, _prefetch_float = make_prefetch(wp.float16), make_prefetch(wp.float32)
+
+
+@functools.cache
+def make_prefetch_texture(kinds: tuple[str, ...]):
+    """`prefetch_texture(tables, texture, uv)`: has the pixels around `uv` on their way.
+
+    On CUDA, where other threads run meanwhile, it does nothing.
+
+    Args:
+        kinds: As for `make_eval_texture`.
+    """
+    has_bytes = "bytes" in kinds
+    has_shorts = "shorts" in kinds
+    has_halves = "halves" in kinds
+    has_floats = "floats" in kinds
+
+    @wp.func
+    def prefetch_texture(tables: TextureTables, texture: int, surface_uv: wp.vec2):
+        record = tables.records[texture]
+        uv = texture_uv(record, surface_uv)
+        if record.kind == KIND_CHECKERBOARD or not is_finite(uv[0] + uv[1]):
+            return
+        position = pixel_position(record, uv)
+        x = wrap_coordinate(int(wp.floor(position[0] - 0.5)), record.width, record.wrap)
+        y = int(wp.floor(position[1] - 0.5))
+        for k in range(2):
+            pixel = wrap_coordinate(y + k, record.height, record.wrap) * record.width + x
+            i = record.first + wp.int64(pixel) * wp.int64(record.channels)
+            if wp.static(has_bytes):
+                if record.kind == KIND_BYTES:
+                    _prefetch_byte(tables.bytes, i)
+            if wp.static(has_shorts):
+                if record.kind == KIND_SHORTS:
+                    _prefetch_short(tables.shorts, i)
+            if wp.static(has_halves):
+                if record.kind == KIND_HALVES:
+                    _prefetch_half(tables.halves, i)
+            if wp.static(has_floats):
+                if record.kind == KIND_FLOATS:
+                    _prefetch_float(tables.floats, i)
+
+    return prefetch_texture
+
+
 @functools.cache
 def make_eval_texture(kinds: tuple[str, ...]):
     """`eval_texture(tables, texture, uv) -> vec3` for the kinds of texture in a scene.
@@ -180,7 +228,7 @@ def make_eval_texture(kinds: tuple[str, ...]):
     def eval_texture(tables: TextureTables, texture: int, surface_uv: wp.vec2) -> wp.vec3:
         record = tables.records[texture]
         uv = texture_uv(record, surface_uv)
-        if not wp.isfinite(uv[0] + uv[1]):
+        if not is_finite(uv[0] + uv[1]):
             return wp.vec3(0.0)
         if wp.static(has_checkerboard):
             if record.kind == KIND_CHECKERBOARD:
@@ -224,7 +272,7 @@ def make_eval_gradient(kinds: tuple[str, ...]):
     def eval_gradient(tables: TextureTables, texture: int, surface_uv: wp.vec2) -> wp.vec2:
         record = tables.records[texture]
         uv = texture_uv(record, surface_uv)
-        if record.kind == KIND_CHECKERBOARD or not wp.isfinite(uv[0] + uv[1]):
+        if record.kind == KIND_CHECKERBOARD or not is_finite(uv[0] + uv[1]):
             return wp.vec2(0.0)
         position = pixel_position(record, uv) - wp.vec2(0.5)
         x = int(wp.floor(position[0]))

@@ -15,7 +15,9 @@ from wavefront.queues import (
     allocate_struct,
     bytes_per_slot,
     push,
+    queue_end,
     queue_size,
+    slot_at,
 )
 from wavefront.scene import description as d
 
@@ -40,6 +42,27 @@ def test_push(capacity):
     assert counters[queues.HITS] == 12
     assert counters[queues.STATUS] == (0 if capacity >= 12 else int(queues.STATUS_QUEUE_OVERFLOW))
     assert sizes.numpy().max() == kept
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def visit_kernel(queue: Queue, visits: wp.array(dtype=wp.int32)):
+    for i in range(wp.tid(), queue_end(queue, wp.tid())):
+        visits[slot_at(queue, i)] += 1
+
+
+@pytest.mark.parametrize(("entries", "threads"), [(0, 1), (1, 1), (12, 1), (12, 12), (12, 20), (30, 20)])
+def test_every_entry_is_visited_once(entries, threads):
+    """By whatever number of threads; what did not fit is not there."""
+    counters = Counters()
+    queue = counters.queue("hits", capacity=20)
+    slots = np.random.default_rng(1).permutation(20).astype(np.int32)
+    counters.storage["hits"].numpy()[:20] = slots
+    queue.count.fill_(entries)
+    visits = wp.zeros(20, dtype=wp.int32, device=DEVICE)
+    launch(visit_kernel, threads, queue, visits)
+    expected = np.zeros(20, np.int32)
+    expected[slots[:entries]] = 1
+    np.testing.assert_array_equal(visits.numpy(), expected)
 
 
 def test_queue_set():

@@ -12,6 +12,7 @@ import warp as wp
 
 from wavefront.bsdf.frame import ShadingFrame, terminator_alpha2
 from wavefront.bsdf.tables import MAP_BUMP, MapRecord, MaterialTables
+from wavefront.finite import is_finite, is_finite3
 from wavefront.surface import Vertex
 from wavefront.texture import TextureTables, make_eval_gradient, make_eval_parameter
 from wavefront.warp_samples import to_local, to_world
@@ -29,7 +30,7 @@ def bump_normal(gradient: wp.vec2, jacobian: wp.vec3, geometric_normal: wp.vec3)
     b = jacobian[1]
     c = jacobian[2]
     n = wp.vec3(-gradient[0] / a, (gradient[0] * b / a - gradient[1]) / c, 1.0)
-    if a * c == 0.0 or not wp.isfinite(n):  # no UVs from which a slope could be told
+    if a * c == 0.0 or not is_finite3(n):  # no UVs from which a slope could be told
         n = wp.vec3(0.0, 0.0, 1.0)
     return wp.where(wp.dot(geometric_normal, n) < 0.0, -n, n)
 
@@ -37,7 +38,7 @@ def bump_normal(gradient: wp.vec2, jacobian: wp.vec3, geometric_normal: wp.vec3)
 @wp.func
 def unit_or(v: wp.vec3, fallback: wp.vec3) -> wp.vec3:
     length = wp.length(v)
-    if length > 0.0 and wp.isfinite(length):
+    if length > 0.0 and is_finite(length):
         return v / length
     return fallback
 

@@ -9,12 +9,13 @@ from 1 - z^2, which is 0 in float32 for the slopes of a lobe with alpha < 3e-4.
 
 import warp as wp
 
+from wavefront.warp_samples import unit_circle
+
 DISTRIBUTION_GGX = wp.constant(0)
 DISTRIBUTION_BECKMANN = wp.constant(1)
 
 _INV_PI = wp.constant(0.3183098861837907)
 _INV_SQRT_PI = wp.constant(0.5641895835477563)
-_TWO_PI = wp.constant(6.283185307179586)
 _STEP = wp.constant(5.9604644775390625e-8)  # 2^-24, the spacing of 24-bit uniform numbers
 _MAX_ITERATIONS = wp.constant(16)
 
@@ -106,10 +107,8 @@ def _sample_visible_ggx(wo: wp.vec3, alpha: wp.vec2, u: wp.vec2) -> wp.vec3:
     one_minus_z = (w[0] * w[0] + w[1] * w[1]) / one_plus_z
     h_z = (1.0 - u[1]) * one_plus_z
     sin_c = wp.sqrt(u[1] * one_plus_z * (h_z + one_minus_z))
-    phi = _TWO_PI * u[0]
-    h_x = sin_c * wp.cos(phi) + w[0]
-    h_y = sin_c * wp.sin(phi) + w[1]
-    return wp.normalize(wp.vec3(alpha[0] * h_x, alpha[1] * h_y, h_z))
+    h = sin_c * unit_circle(u[0]) + wp.vec2(w[0], w[1])
+    return wp.normalize(wp.vec3(alpha[0] * h[0], alpha[1] * h[1], h_z))
 
 
 @wp.func

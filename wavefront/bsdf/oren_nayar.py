@@ -11,7 +11,7 @@ A white surface then reflects at most all it receives, at grazing incidence; rou
 import warp as wp
 
 from wavefront.bsdf.record import BsdfEval, BsdfSample, no_eval, no_sample
-from wavefront.warp_samples import cosine_hemisphere_pdf, square_to_cosine_hemisphere
+from wavefront.warp_samples import cosine_hemisphere_pdf, square_to_cosine_hemisphere, unit_circle
 
 _TWO_PI = wp.constant(6.283185307179586)
 _FUJII = wp.constant(0.9041296601282299)  # pi / 2 - 2 / 3
@@ -41,8 +41,8 @@ def sample_oren_nayar(reflectance: wp.vec3, roughness: float, wo: wp.vec3, u: wp
     if wo[2] > 0.0:
         wi = wp.vec3(0.0, 0.0, 1.0)
         if u[2] < roughness / (1.0 + roughness):
-            r = wp.sqrt((1.0 - u[1]) * (1.0 + u[1]))
-            wi = wp.vec3(r * wp.cos(_TWO_PI * u[0]), r * wp.sin(_TWO_PI * u[0]), u[1])
+            p = wp.sqrt((1.0 - u[1]) * (1.0 + u[1])) * unit_circle(u[0])
+            wi = wp.vec3(p[0], p[1], u[1])
         else:
             wi = square_to_cosine_hemisphere(wp.vec2(u[0], u[1]))
         e = eval_oren_nayar(reflectance, roughness, wo, wi)

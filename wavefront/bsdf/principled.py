@@ -39,12 +39,11 @@ from wavefront.bsdf.microfacet import (
 from wavefront.bsdf.record import BsdfEval, BsdfSample, no_eval, no_sample
 from wavefront.bsdf.rough_dielectric import eval_rough_dielectric, sample_rough_dielectric
 from wavefront.film import LUMINANCE
-from wavefront.warp_samples import cosine_hemisphere_pdf, square_to_cosine_hemisphere
+from wavefront.warp_samples import cosine_hemisphere_pdf, square_to_cosine_hemisphere, unit_circle
 
 MIN_ALPHA = wp.constant(1.0e-3)  # of the main specular lobe
 _CLEARCOAT_G_ALPHA = wp.constant(0.25)
 _INV_PI = wp.constant(0.3183098861837907)
-_TWO_PI = wp.constant(6.283185307179586)
 
 
 @wp.struct
@@ -123,8 +122,8 @@ def sample_gtr1(alpha: float, u: wp.vec2) -> wp.vec3:
     a = alpha * alpha
     sin2 = wp.min(a * (wp.exp(-2.0 * u[1] * wp.log(alpha)) - 1.0) / (1.0 - a), 1.0)
     r = wp.sqrt(sin2)
-    phi = _TWO_PI * u[0]
-    return wp.vec3(r * wp.cos(phi), r * wp.sin(phi), wp.sqrt(1.0 - sin2))
+    p = r * unit_circle(u[0])
+    return wp.vec3(p[0], p[1], wp.sqrt(1.0 - sin2))
 
 
 # --- the parts above the surface -------------------------------------------------------------------------------------

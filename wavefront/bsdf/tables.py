@@ -60,6 +60,7 @@ class Material:
     opacity: wp.float32
     opacity_texture: wp.int32
     cutoff: wp.float32  # above 0: opacity is 1 from here on, and 0 below
+    texture: wp.int32  # one of those that are looked up, to be fetched ahead; -1: none
 
 
 @wp.struct

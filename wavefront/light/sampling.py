@@ -118,26 +118,24 @@ def make_light_sampler(kinds: tuple[str, ...], textures: tuple[str, ...]):
                 b2 = b12[1]
                 q = b[0] * v0 + b[1] * v1 + b2 * v2
                 to_light = q - p
-                wi = wp.normalize(to_light)
                 extent = triangle_extent(v0, v1, v2)
-                cross = scaled_cross(v0, v1, v2, extent)
-                normal = wp.normalize(cross)
-                shading_normal = normal
+                cross = scaled_cross(v0, v1, v2, extent)  # along the geometric normal
                 shape = geometry.shapes[geometry.shape_of[light.primitive]]
                 if shape.smooth == 1:
                     shading_normal = b[0] * geometry.normals[i0] + b[1] * geometry.normals[i1]
                     shading_normal += b2 * geometry.normals[i2]
-                if wp.dot(shading_normal, normal) < 0.0:
-                    normal = -normal
-                if shape.two_sided == 1 and wp.dot(normal, wi) > 0.0:
-                    normal = -normal
+                    if wp.dot(shading_normal, cross) < 0.0:
+                        cross = -cross
+                if shape.two_sided == 1 and wp.dot(cross, to_light) > 0.0:
+                    cross = -cross
                 # Emission is towards the front of the geometric normal; the density in area, 2 / |cross|, becomes one
                 # in solid angle by distance^2 / cos. Both lengths are in units of the extent.
-                cos_light = -wp.dot(normal, wi)
-                if cos_light > 0.0:
+                if wp.dot(cross, to_light) < 0.0:
+                    wi = wp.normalize(to_light)
+                    normal = wp.normalize(cross)
                     result.wi = wi
                     result.target = q + position_error(v0, v1, v2, b[0], b[1], normal) * normal
-                    result.pdf = light.pmf * 2.0 * wp.length_sq(to_light / extent) / (cos_light * wp.length(cross))
+                    result.pdf = light.pmf * 2.0 * wp.length_sq(to_light / extent) / -wp.dot(cross, wi)
                     uv = wp.vec2(0.0)
                     if wp.static(textured):
                         uv = b[0] * geometry.uvs[i0] + b[1] * geometry.uvs[i1] + b2 * geometry.uvs[i2]

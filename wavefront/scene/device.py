@@ -23,7 +23,9 @@ from wavefront.scene.medium_upload import MediumUpload
 from wavefront.scene.meshes import LARGEST_COORDINATE, SMALLEST_TRIANGLE, clear_cache, tessellate
 from wavefront.scene.texture_upload import TextureAtlas, struct_array
 from wavefront.scene.transforms import to_matrix
-from wavefront.texture import TextureTables
+from wavefront.texture import IMAGE_TYPES, TextureTables
+
+CACHE_BYTES = 1 << 20  # of one core of a CPU
 
 
 @dataclasses.dataclass
@@ -50,6 +52,7 @@ class DeviceScene:
     instances: tuple[str, ...]
     accel: str
     streams: bool
+    ahead: bool
     texture_kinds: tuple[str, ...]
     light_kinds: tuple[str, ...]
     light_texture_kinds: tuple[str, ...]
@@ -69,6 +72,13 @@ def upload_scene(scene: description.Scene, device: str, accel: str = "bvh") -> D
         SceneError: A file is missing or unreadable, a mesh is empty, an emitter has no area.
     """
     return _Upload(scene, device, accel).run()
+
+
+def _vertex_bytes(geometry: Geometry, textures: TextureTables) -> int:
+    """Memory of what vertices are made of and of the images on them."""
+    arrays = [getattr(geometry, name) for name in ("points", "indices", "normals", "uvs", "shape_of")]
+    arrays += [getattr(textures, name) for name in IMAGE_TYPES]
+    return sum(array.capacity for array in arrays if array is not None)
 
 
 class _Upload:
@@ -98,10 +108,11 @@ class _Upload:
         lights.emitters = struct_array(EmitterRecord, self.emitters, self.device)
         geometry.shapes = struct_array(Shape, self.shape_records, self.device)
         self.media.upload(geometry, self.device)
+        textures, cpu = self.atlas.upload(self.device), wp.get_device(self.device).is_cpu
         return DeviceScene(
             geometry=geometry,
             materials=self.materials.upload(self.device),
-            textures=self.atlas.upload(self.device),
+            textures=textures,
             lights=lights,
             triangle_count=geometry.triangle_count,
             sphere_count=geometry.spheres.shape[0] if geometry.spheres else 0,
@@ -122,7 +133,8 @@ class _Upload:
                 if any(getattr(part, field) for part in parts[1:])
             ),
             accel=self.accel,
-            streams=self.accel == "bvh" and wp.get_device(self.device).is_cpu and bool(self.shape_records),
+            streams=self.accel == "bvh" and cpu and bool(self.shape_records),
+            ahead=cpu and _vertex_bytes(geometry, textures) > CACHE_BYTES,
             texture_kinds=tuple(sorted(set(self.atlas.kinds))),
             light_kinds=light_kinds,
             light_texture_kinds=tuple(sorted(self.light_texture_kinds)),

@@ -143,7 +143,7 @@ class MaterialUpload:
         bsdf = resolve_bsdf(self.scene, ref)
         if id(bsdf) in self.known:
             return self.known[id(bsdf)]
-        references = self.atlas.references
+        references = len(self.atlas.references)
         material = {"opacity": 1.0, "opacity_texture": -1}
         inner = bsdf
         if isinstance(inner, description.Mask):
@@ -165,7 +165,9 @@ class MaterialUpload:
         front, back = (inside if outer < 0 else outer for *_, inside in sides)
         self.maps_of.append({"front": front, "back": back, "mirrored": int(outer < 0)})
         self.materials.append(material)
-        if self.atlas.references > references:
+        textures = self.atlas.references[references:]
+        material["texture"] = textures[0] if textures else -1
+        if textures:
             self.textured.add(len(self.materials) - 1)
         self.known[id(bsdf)] = len(self.materials) - 1
         self.keep_alive.append(bsdf)  # the id stays taken

@@ -49,14 +49,14 @@ class TextureAtlas:
         self.pixels: dict[str, list[np.ndarray]] = {kind: [] for kind in IMAGE_TYPES}
         self.known: dict[tuple, int] = {}
         self.images: dict[tuple, tuple[str, int, np.ndarray]] = {}
-        self.references = 0  # of parameters to textures so far
+        self.references: list[int] = []  # of parameters to textures so far: the indices of those
 
     def parameter(self, scene: description.Scene, value, where: str, scalar: bool = False) -> tuple[object, int]:
         """Value and texture index (-1: none) of a parameter."""
         value = resolve_texture(scene, value)
         if isinstance(value, (description.Bitmap, description.Checkerboard)):
-            self.references += 1
-            return (1.0 if scalar else np.ones(3)), self.add(value, where, scalar)
+            self.references.append(self.add(value, where, scalar))
+            return (1.0 if scalar else np.ones(3)), self.references[-1]
         return (float(value) if scalar and np.ndim(value) == 0 else rgb(value)), -1
 
     def add(self, texture: description.Texture, where: str, scalar: bool) -> int:

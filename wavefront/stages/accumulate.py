@@ -7,6 +7,7 @@ import functools
 import warp as wp
 
 from wavefront.film import FilmArrays, luminance
+from wavefront.finite import is_finite3
 from wavefront.queues import NONFINITE_ACCUMULATE, SAMPLE_COUNT, TILE_HEIGHT, TILE_WIDTH, TILE_X, TILE_Y, Paths
 from wavefront.stage_kernel import stage_kernel
 
@@ -48,7 +49,7 @@ def make_accumulate(variance: bool, weighted: bool = False):
                 weighted_luminance = film.weighted_luminance[pixel]
         for s in range(samples):
             L = paths.L[local * samples + s]
-            if not wp.isfinite(L):  # each contribution was finite, their sum overflowed
+            if not is_finite3(L):  # each contribution was finite, their sum overflowed
                 wp.atomic_add(counters, NONFINITE_ACCUMULATE, 1)
                 L = wp.vec3(0.0)
             contribution = wp.vec3d(wp.float64(L[0]), wp.float64(L[1]), wp.float64(L[2]))

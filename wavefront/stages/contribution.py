@@ -2,13 +2,14 @@
 
 import warp as wp
 
+from wavefront.finite import is_radiance
 from wavefront.queues import Paths
 
 
 @wp.func
 def add_radiance(paths: Paths, slot: int, L: wp.vec3, counters: wp.array[wp.int32], nonfinite_counter: int):
     """Adds `L` to the path's radiance; a non-finite or negative contribution is counted and left out."""
-    if wp.isfinite(L) and wp.min(L) >= 0.0:
+    if is_radiance(L):
         paths.L[slot] += L
     else:
         wp.atomic_add(counters, nonfinite_counter, 1)

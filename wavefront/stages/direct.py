@@ -9,10 +9,12 @@ import warp as wp
 from wavefront.accel.geometry import Geometry
 from wavefront.bsdf.dispatch import is_smooth
 from wavefront.bsdf.tables import MaterialTables
+from wavefront.finite import is_radiance
 from wavefront.light.mis import power_heuristic
 from wavefront.light.tables import DELTA, LightTables
-from wavefront.queues import DEPTH, NONFINITE_DIRECT, Paths, Queue, ShadowRays, Surfaces, push, queue_size
+from wavefront.queues import DEPTH, NONFINITE_DIRECT, Paths, Queue, ShadowRays, Surfaces, push, queue_end, slot_at
 from wavefront.stage_kernel import stage_kernel
+from wavefront.stages.ahead import make_fetch_textures
 from wavefront.stages.light_proposal import make_light_proposal
 from wavefront.texture import TextureTables
 
@@ -29,12 +31,15 @@ def make_direct(
     maps: tuple[str, ...],
     media: bool = False,
     sampler: str = "independent",
+    ahead: bool = False,
 ):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
     propose_light, aim_shadow_ray = make_light_proposal(
         bsdfs, mask, textures, lights, light_textures, uvs, tangents, maps, media, sampler
     )
     extended = any(kind not in DELTA for kind in lights)
+
+    fetch_textures = make_fetch_textures(textures, uvs, ahead)
 
     @stage_kernel
     def sample_direct_light(
@@ -51,31 +56,32 @@ def make_direct(
         shadow: Queue,
         counters: wp.array[wp.int32],
     ):
-        i = wp.tid()
-        if i >= queue_size(hits):
-            return
-        slot = hits.slots[i]
-        cos_o = -wp.dot(surfaces.shading_normal[slot], paths.direction[slot])
-        if not is_smooth(materials.materials[surfaces.material[slot]], cos_o):
-            return
+        for i in range(wp.tid(), queue_end(hits, wp.tid())):
+            fetch_textures(materials, textures, surfaces, hits, i)
+            slot = slot_at(hits, i)
+            cos_o = -wp.dot(surfaces.shading_normal[slot], paths.direction[slot])
+            if not is_smooth(materials.materials[surfaces.material[slot]], cos_o):
+                continue
 
-        # propose and evaluate
-        proposal = propose_light(geometry, materials, textures, lights, paths, surfaces, slot, seed, counters[DEPTH])
-        light = proposal.light
-        bsdf = proposal.bsdf
-        if bsdf.value[0] + bsdf.value[1] + bsdf.value[2] == 0.0:
-            return
+            # propose and evaluate
+            proposal = propose_light(
+                geometry, materials, textures, lights, paths, surfaces, slot, seed, counters[DEPTH]
+            )
+            light = proposal.light
+            bsdf = proposal.bsdf
+            if bsdf.value[0] + bsdf.value[1] + bsdf.value[2] == 0.0:
+                continue
 
-        # resolve
-        weight = 1.0 / light.pdf
-        if wp.static(extended):
-            if light.delta == 0:
-                weight *= power_heuristic(light.pdf, bsdf.pdf)
-        L = weight * wp.cw_mul(paths.beta[slot], wp.cw_mul(bsdf.value, light.L))
-        if not (wp.isfinite(L) and wp.min(L) >= 0.0):
-            wp.atomic_add(counters, NONFINITE_DIRECT, 1)
-            return
-        if aim_shadow_ray(geometry, surfaces, slot, light, L, shadow_rays):
-            push(shadow, slot, counters)
+            # resolve
+            weight = 1.0 / light.pdf
+            if wp.static(extended):
+                if light.delta == 0:
+                    weight *= power_heuristic(light.pdf, bsdf.pdf)
+            L = weight * wp.cw_mul(paths.beta[slot], wp.cw_mul(bsdf.value, light.L))
+            if not is_radiance(L):
+                wp.atomic_add(counters, NONFINITE_DIRECT, 1)
+                continue
+            if aim_shadow_ray(geometry, surfaces, slot, light, L, shadow_rays):
+                push(shadow, slot, counters)
 
     return sample_direct_light

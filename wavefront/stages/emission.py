@@ -10,7 +10,7 @@ from wavefront.accel.geometry import Geometry
 from wavefront.light.mis import power_heuristic
 from wavefront.light.sampling import make_light_sampler
 from wavefront.light.tables import AREA, LightTables
-from wavefront.queues import NONFINITE_EMISSION, Paths, Queue, Surfaces, queue_size
+from wavefront.queues import NONFINITE_EMISSION, Paths, Queue, Surfaces, queue_end, slot_at
 from wavefront.stage_kernel import stage_kernel
 from wavefront.stages.contribution import add_radiance
 from wavefront.texture import TextureTables, make_eval_parameter
@@ -35,30 +35,28 @@ def make_emission(lights: tuple[str, ...], light_textures: tuple[str, ...], ligh
         # out
         counters: wp.array[wp.int32],
     ):
-        i = wp.tid()
-        if i >= queue_size(emissive):
-            return
-        slot = emissive.slots[i]
-        light = surfaces.light[slot]
-        emitter = lights.emitters[lights.lights[light].emitter]
-        weight = float(1.0)
-        if wp.static(light_sampling):
-            pdf = paths.pdf[slot]
-            if pdf > 0.0:
-                other = light_pdf(
-                    lights,
-                    geometry,
-                    light,
-                    paths.origin[slot],
-                    paths.direction[slot],
-                    surfaces.position[slot],
-                    surfaces.geometric_normal[slot],
-                )
-                weight = power_heuristic(pdf, other)
-        uv = wp.vec2(0.0)
-        if wp.static(textured):
-            uv = surfaces.uv[slot]
-        radiance = eval_parameter(textures, emitter.radiance, emitter.radiance_texture, uv)
-        add_radiance(paths, slot, weight * wp.cw_mul(paths.beta[slot], radiance), counters, NONFINITE_EMISSION)
+        for i in range(wp.tid(), queue_end(emissive, wp.tid())):
+            slot = slot_at(emissive, i)
+            light = surfaces.light[slot]
+            emitter = lights.emitters[lights.lights[light].emitter]
+            weight = float(1.0)
+            if wp.static(light_sampling):
+                pdf = paths.pdf[slot]
+                if pdf > 0.0:
+                    other = light_pdf(
+                        lights,
+                        geometry,
+                        light,
+                        paths.origin[slot],
+                        paths.direction[slot],
+                        surfaces.position[slot],
+                        surfaces.geometric_normal[slot],
+                    )
+                    weight = power_heuristic(pdf, other)
+            uv = wp.vec2(0.0)
+            if wp.static(textured):
+                uv = surfaces.uv[slot]
+            radiance = eval_parameter(textures, emitter.radiance, emitter.radiance_texture, uv)
+            add_radiance(paths, slot, weight * wp.cw_mul(paths.beta[slot], radiance), counters, NONFINITE_EMISSION)
 
     return add_emission

@@ -10,7 +10,7 @@ from wavefront.light.envmap import envmap_storage, make_envmap
 from wavefront.light.mis import power_heuristic
 from wavefront.light.sun import in_sun
 from wavefront.light.tables import LightTables
-from wavefront.queues import NONFINITE_ESCAPED, Paths, Queue, queue_size
+from wavefront.queues import NONFINITE_ESCAPED, Paths, Queue, queue_end, slot_at
 from wavefront.stage_kernel import stage_kernel
 from wavefront.stages.contribution import add_radiance
 from wavefront.warp_samples import cone_pdf, sphere_pdf
@@ -33,35 +33,33 @@ def make_escaped(escape_lights: tuple[str, ...], light_sampling: bool):
         # out
         counters: wp.array[wp.int32],
     ):
-        i = wp.tid()
-        if i >= queue_size(escaped):
-            return
-        slot = escaped.slots[i]
-        L = wp.vec3(0.0)
-        if wp.static(has_constant):
-            light = lights.lights[lights.environment]
-            weight = float(1.0)
-            if wp.static(light_sampling):
-                if paths.pdf[slot] > 0.0:
-                    weight = power_heuristic(paths.pdf[slot], light.pmf * sphere_pdf())
-            L += weight * lights.emitters[light.emitter].radiance
-        if wp.static(has_envmap):
-            found = eval_envmap(lights.envmap, paths.direction[slot])
-            weight = float(1.0)
-            if wp.static(light_sampling):
-                if paths.pdf[slot] > 0.0:
-                    weight = power_heuristic(paths.pdf[slot], lights.lights[lights.environment].pmf * found.pdf)
-            L += weight * found.L
-        if wp.static(has_sun):
-            for k in range(lights.sun_count):
-                light = lights.lights[lights.first_sun + k]
-                sun = lights.distant[light.emitter]
-                if in_sun(sun, paths.direction[slot]):
-                    weight = float(1.0)
-                    if wp.static(light_sampling):
-                        if paths.pdf[slot] > 0.0:
-                            weight = power_heuristic(paths.pdf[slot], light.pmf * cone_pdf(sun.one_minus_cos))
-                    L += weight * sun.emitted
-        add_radiance(paths, slot, wp.cw_mul(paths.beta[slot], L), counters, NONFINITE_ESCAPED)
+        for i in range(wp.tid(), queue_end(escaped, wp.tid())):
+            slot = slot_at(escaped, i)
+            L = wp.vec3(0.0)
+            if wp.static(has_constant):
+                light = lights.lights[lights.environment]
+                weight = float(1.0)
+                if wp.static(light_sampling):
+                    if paths.pdf[slot] > 0.0:
+                        weight = power_heuristic(paths.pdf[slot], light.pmf * sphere_pdf())
+                L += weight * lights.emitters[light.emitter].radiance
+            if wp.static(has_envmap):
+                found = eval_envmap(lights.envmap, paths.direction[slot])
+                weight = float(1.0)
+                if wp.static(light_sampling):
+                    if paths.pdf[slot] > 0.0:
+                        weight = power_heuristic(paths.pdf[slot], lights.lights[lights.environment].pmf * found.pdf)
+                L += weight * found.L
+            if wp.static(has_sun):
+                for k in range(lights.sun_count):
+                    light = lights.lights[lights.first_sun + k]
+                    sun = lights.distant[light.emitter]
+                    if in_sun(sun, paths.direction[slot]):
+                        weight = float(1.0)
+                        if wp.static(light_sampling):
+                            if paths.pdf[slot] > 0.0:
+                                weight = power_heuristic(paths.pdf[slot], light.pmf * cone_pdf(sun.one_minus_cos))
+                        L += weight * sun.emitted
+            add_radiance(paths, slot, wp.cw_mul(paths.beta[slot], L), counters, NONFINITE_ESCAPED)
 
     return add_environment

@@ -13,8 +13,9 @@ from wavefront.accel.geometry import Geometry
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.light.tables import LightTables
 from wavefront.proposals import LightProposals
-from wavefront.queues import DEPTH, Paths, Queue, ShadowRays, Surfaces, push, queue_size
+from wavefront.queues import DEPTH, Paths, Queue, ShadowRays, Surfaces, push, queue_end, slot_at
 from wavefront.stage_kernel import stage_kernel
+from wavefront.stages.ahead import make_fetch_textures
 from wavefront.stages.light_proposal import make_light_proposal
 from wavefront.texture import TextureTables
 
@@ -31,11 +32,13 @@ def make_guided_direct(
     maps: tuple[str, ...],
     media: bool,
     sampler: str,
+    ahead: bool,
 ):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
     propose_light, aim_shadow_ray = make_light_proposal(
         bsdfs, mask, textures, lights, light_textures, uvs, tangents, maps, media, sampler
     )
+    fetch_textures = make_fetch_textures(textures, uvs, ahead)
 
     @stage_kernel
     def propose_direct_light(
@@ -53,20 +56,21 @@ def make_guided_direct(
         lit: Queue,
         counters: wp.array[wp.int32],
     ):
-        i = wp.tid()
-        if i >= queue_size(guided):
-            return
-        slot = guided.slots[i]
-        proposal = propose_light(geometry, materials, textures, lights, paths, surfaces, slot, seed, counters[DEPTH])
-        light = proposal.light
-        bsdf = proposal.bsdf
-        if bsdf.value[0] + bsdf.value[1] + bsdf.value[2] == 0.0:
-            return
-        if aim_shadow_ray(geometry, surfaces, slot, light, wp.cw_mul(bsdf.value, light.L), shadow_rays):
-            light_proposals.wi[slot] = light.wi
-            light_proposals.pdf[slot] = light.pdf
-            light_proposals.delta[slot] = light.delta
-            light_proposals.bsdf_pdf[slot] = bsdf.pdf
-            push(lit, slot, counters)
+        for i in range(wp.tid(), queue_end(guided, wp.tid())):
+            fetch_textures(materials, textures, surfaces, guided, i)
+            slot = slot_at(guided, i)
+            proposal = propose_light(
+                geometry, materials, textures, lights, paths, surfaces, slot, seed, counters[DEPTH]
+            )
+            light = proposal.light
+            bsdf = proposal.bsdf
+            if bsdf.value[0] + bsdf.value[1] + bsdf.value[2] == 0.0:
+                continue
+            if aim_shadow_ray(geometry, surfaces, slot, light, wp.cw_mul(bsdf.value, light.L), shadow_rays):
+                light_proposals.wi[slot] = light.wi
+                light_proposals.pdf[slot] = light.pdf
+                light_proposals.delta[slot] = light.delta
+                light_proposals.bsdf_pdf[slot] = bsdf.pdf
+                push(lit, slot, counters)
 
     return propose_direct_light

@@ -11,7 +11,7 @@ from wavefront.bsdf.dispatch import make_bsdf
 from wavefront.bsdf.frame import make_frame
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.proposals import Proposals
-from wavefront.queues import NONFINITE_SCATTER, Paths, Queue, Surfaces, queue_size
+from wavefront.queues import NONFINITE_SCATTER, Paths, Queue, Surfaces, queue_end, slot_at
 from wavefront.stage_kernel import stage_kernel
 from wavefront.texture import TextureTables
 
@@ -45,34 +45,32 @@ def make_guided_evaluate(
         # out
         counters: wp.array[wp.int32],
     ):
-        i = wp.tid()
-        if i >= queue_size(proposed):
-            return
-        slot = proposed.slots[i]
-        wi = proposals.wi[slot]
-        length2 = wp.length_sq(wi)
-        weight = wp.vec3(0.0)
-        pdf = float(0.0)
-        eta = float(1.0)
-        if wp.abs(length2 - 1.0) <= UNIT_TOLERANCE:
-            wi = wp.normalize(wi)
-            proposals.wi[slot] = wi
-            material = surfaces.material[slot]
-            uv = wp.vec2(0.0)
-            if wp.static(uvs):
-                uv = surfaces.uv[slot]
-            frame = frame_at(surfaces, slot)
-            wo = -paths.direction[slot]
-            bsdf = eval_bsdf(materials, textures, material, uv, frame, wo, wi)
-            weight = bsdf.value
-            pdf = bsdf.pdf
+        for i in range(wp.tid(), queue_end(proposed, wp.tid())):
+            slot = slot_at(proposed, i)
+            wi = proposals.wi[slot]
+            length2 = wp.length_sq(wi)
+            weight = wp.vec3(0.0)
+            pdf = float(0.0)
+            eta = float(1.0)
+            if wp.abs(length2 - 1.0) <= UNIT_TOLERANCE:
+                wi = wp.normalize(wi)
+                proposals.wi[slot] = wi
+                material = surfaces.material[slot]
+                uv = wp.vec2(0.0)
+                if wp.static(uvs):
+                    uv = surfaces.uv[slot]
+                frame = frame_at(surfaces, slot)
+                wo = -paths.direction[slot]
+                bsdf = eval_bsdf(materials, textures, material, uv, frame, wo, wi)
+                weight = bsdf.value
+                pdf = bsdf.pdf
+                if wp.static(transmission):
+                    eta = crossed_eta(materials, material, frame, wo, wi)
+            elif length2 != 0.0:  # NaN, or no unit vector
+                wp.atomic_add(counters, NONFINITE_SCATTER, 1)
+            proposals.weight[slot] = weight
+            proposals.bsdf_pdf[slot] = pdf
             if wp.static(transmission):
-                eta = crossed_eta(materials, material, frame, wo, wi)
-        elif length2 != 0.0:  # NaN, or no unit vector
-            wp.atomic_add(counters, NONFINITE_SCATTER, 1)
-        proposals.weight[slot] = weight
-        proposals.bsdf_pdf[slot] = pdf
-        if wp.static(transmission):
-            proposals.eta[slot] = eta
+                proposals.eta[slot] = eta
 
     return evaluate_directions

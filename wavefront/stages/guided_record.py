@@ -11,7 +11,7 @@ import functools
 
 import warp as wp
 
-from wavefront.queues import DEPTH, Paths, Queue, queue_size
+from wavefront.queues import DEPTH, Paths, Queue, queue_end, slot_at
 from wavefront.recording import RecordScratch, Rows, record_row
 from wavefront.stage_kernel import stage_kernel
 
@@ -24,12 +24,10 @@ def put_throughput_aside(
     scratch: RecordScratch,
 ):
     """Before the intersection."""
-    i = wp.tid()
-    if i >= queue_size(rays):
-        return
-    slot = rays.slots[i]
-    scratch.beta[slot] = paths.beta[slot]
-    paths.beta[slot] = wp.vec3(1.0)
+    for i in range(wp.tid(), queue_end(rays, wp.tid())):
+        slot = slot_at(rays, i)
+        scratch.beta[slot] = paths.beta[slot]
+        paths.beta[slot] = wp.vec3(1.0)
 
 
 @functools.cache
@@ -50,31 +48,29 @@ def make_record_arrivals(taken: bool):
         scratch: RecordScratch,
         rows: Rows,
     ):
-        i = wp.tid()
-        if i >= queue_size(rays):
-            return
-        slot = rays.slots[i]
-        through = paths.beta[slot]
-        paths.beta[slot] = wp.cw_mul(scratch.beta[slot], through)
-        emission = scratch.emission[slot]
-        scratch.emission[slot] = wp.vec3(0.0)
-        whole = wp.vec3(0.0)
-        if wp.static(taken):
-            whole = scratch.whole_emission[slot]
-            scratch.whole_emission[slot] = wp.vec3(0.0)
-        row = record_row(rows, tile, slot)
-        if row < 0:
-            return
-        depth = counters[DEPTH]
-        entry = wp.min(depth, rows.depth) * rows.count + row
-        if depth <= rows.depth:
-            rows.arrival[entry] = emission
-            rows.through[entry] = through
+        for i in range(wp.tid(), queue_end(rays, wp.tid())):
+            slot = slot_at(rays, i)
+            through = paths.beta[slot]
+            paths.beta[slot] = wp.cw_mul(scratch.beta[slot], through)
+            emission = scratch.emission[slot]
+            scratch.emission[slot] = wp.vec3(0.0)
+            whole = wp.vec3(0.0)
             if wp.static(taken):
-                rows.taken[entry] = wp.max(whole - emission, wp.vec3(0.0))
-        else:
-            rows.arrival[entry] += wp.cw_mul(rows.through[entry], emission)
-            rows.through[entry] = wp.cw_mul(rows.through[entry], through)
+                whole = scratch.whole_emission[slot]
+                scratch.whole_emission[slot] = wp.vec3(0.0)
+            row = record_row(rows, tile, slot)
+            if row < 0:
+                continue
+            depth = counters[DEPTH]
+            entry = wp.min(depth, rows.depth) * rows.count + row
+            if depth <= rows.depth:
+                rows.arrival[entry] = emission
+                rows.through[entry] = through
+                if wp.static(taken):
+                    rows.taken[entry] = wp.max(whole - emission, wp.vec3(0.0))
+            else:
+                rows.arrival[entry] += wp.cw_mul(rows.through[entry], emission)
+                rows.through[entry] = wp.cw_mul(rows.through[entry], through)
 
     return record_arrivals
 
@@ -90,16 +86,14 @@ def record_direct_light(
     rows: Rows,
 ):
     """After the shadow rays, which have left in `scratch.visible` what they would have added to the path."""
-    i = wp.tid()
-    if i >= queue_size(shadow):
-        return
-    slot = shadow.slots[i]
-    L = scratch.visible[slot]
-    if wp.max(L) == 0.0:
-        return
-    scratch.visible[slot] = wp.vec3(0.0)
-    paths.L[slot] += L
-    row = record_row(rows, tile, slot)
-    if row >= 0:
-        entry = wp.min(counters[DEPTH], rows.depth) * rows.count + row
-        rows.arrival[entry] += wp.cw_mul(rows.through[entry], scratch.light[slot])
+    for i in range(wp.tid(), queue_end(shadow, wp.tid())):
+        slot = slot_at(shadow, i)
+        L = scratch.visible[slot]
+        if wp.max(L) == 0.0:
+            continue
+        scratch.visible[slot] = wp.vec3(0.0)
+        paths.L[slot] += L
+        row = record_row(rows, tile, slot)
+        if row >= 0:
+            entry = wp.min(counters[DEPTH], rows.depth) * rows.count + row
+            rows.arrival[entry] += wp.cw_mul(rows.through[entry], scratch.light[slot])

@@ -7,9 +7,10 @@ import functools
 
 import warp as wp
 
+from wavefront.finite import is_finite, is_finite3, is_radiance
 from wavefront.medium import medium_towards
 from wavefront.proposals import TECHNIQUE_GUIDE, Proposals, make_bsdf_share, make_scatter_pdf
-from wavefront.queues import DEPTH, NONFINITE_SCATTER, Paths, Queue, Surfaces, push, queue_size
+from wavefront.queues import DEPTH, NONFINITE_SCATTER, Paths, Queue, Surfaces, push, queue_end, slot_at
 from wavefront.recording import Rows, record_row
 from wavefront.rng import PURPOSE_BSDF
 from wavefront.sampler import SAMPLERS
@@ -88,67 +89,65 @@ def make_guided_resolve(
         rows: Rows,
         counters: wp.array[wp.int32],
     ):
-        i = wp.tid()
-        if i >= queue_size(hits):
-            return
-        slot = hits.slots[i]
-        depth = counters[DEPTH]
-        share = bsdf_share(proposals, slot)
-        wi = proposals.wi[slot]
-        bsdf_pdf = proposals.bsdf_pdf[slot]
-        pdf = float(bsdf_pdf)
-        guide_pdf_at = float(0.0)
-        weight = wp.vec3(proposals.weight[slot])
-        if proposals.technique[slot] == TECHNIQUE_GUIDE:
-            guide_pdf_at = proposals.guide_pdf[slot]
-            if wp.static(guide_pdf):
-                pdf = scatter_pdf(share, bsdf_pdf, guide_pdf_at)
-                # Zero where the guide denies a direction of its own by a rounding.
-                weight = wp.where(pdf > 0.0, weight / pdf, wp.vec3(0.0))
-            else:
-                weight = wp.where(bsdf_pdf > 0.0, guide_pdf_at * weight, wp.vec3(0.0))
-        elif share < 1.0:
-            if bsdf_pdf == 0.0:  # a delta: no other technique finds it
-                weight = weight / share
-            elif wp.static(guide_pdf):
+        for i in range(wp.tid(), queue_end(hits, wp.tid())):
+            slot = slot_at(hits, i)
+            depth = counters[DEPTH]
+            share = bsdf_share(proposals, slot)
+            wi = proposals.wi[slot]
+            bsdf_pdf = proposals.bsdf_pdf[slot]
+            pdf = float(bsdf_pdf)
+            guide_pdf_at = float(0.0)
+            weight = wp.vec3(proposals.weight[slot])
+            if proposals.technique[slot] == TECHNIQUE_GUIDE:
                 guide_pdf_at = proposals.guide_pdf[slot]
-                pdf = scatter_pdf(share, bsdf_pdf, guide_pdf_at)
-                weight = (bsdf_pdf / pdf) * weight
+                if wp.static(guide_pdf):
+                    pdf = scatter_pdf(share, bsdf_pdf, guide_pdf_at)
+                    # Zero where the guide denies a direction of its own by a rounding.
+                    weight = wp.where(pdf > 0.0, weight / pdf, wp.vec3(0.0))
+                else:
+                    weight = wp.where(bsdf_pdf > 0.0, guide_pdf_at * weight, wp.vec3(0.0))
+            elif share < 1.0:
+                if bsdf_pdf == 0.0:  # a delta: no other technique finds it
+                    weight = weight / share
+                elif wp.static(guide_pdf):
+                    guide_pdf_at = proposals.guide_pdf[slot]
+                    pdf = scatter_pdf(share, bsdf_pdf, guide_pdf_at)
+                    weight = (bsdf_pdf / pdf) * weight
 
-        beta = wp.cw_mul(paths.beta[slot], weight)
-        finite = wp.isfinite(beta) and wp.isfinite(wi) and wp.isfinite(pdf) and wp.isfinite(guide_pdf_at)
-        if not (finite and wp.min(beta) >= 0.0 and guide_pdf_at >= 0.0):
-            wp.atomic_add(counters, NONFINITE_SCATTER, 1)
-            return
-        if wp.max(beta) == 0.0:
-            return
-        eta = float(1.0)
-        if wp.static(transmission):
-            eta = paths.eta[slot] * proposals.eta[slot]
-            paths.eta[slot] = eta
-        survival = float(1.0)
-        if wp.static(roulette):
-            if depth + 1 >= rr_depth:
-                survival = survival_probability(beta, eta)
-                u = draw(seed, paths.pixel[slot], paths.sample[slot], depth, PURPOSE_BSDF)
-                if u[3] >= survival:
-                    return
-                beta /= survival
-        if wp.static(bool(records)):
-            row = record_row(rows, tile, slot)
-            if row >= 0:
-                wo = -paths.direction[slot]
-                record_scattering(
-                    rows, row, depth, surfaces, slot, wo, wi, pdf, guide_pdf_at, proposals, weight, survival
-                )
-        paths.beta[slot] = beta
-        paths.direction[slot] = wi
-        paths.pdf[slot] = pdf
-        if wp.static(media):
-            paths.medium[slot] = medium_towards(surfaces.media[slot], surfaces.geometric_normal[slot], wi)
-        paths.origin[slot] = spawn_origin(
-            surfaces.position[slot], surfaces.geometric_normal[slot], surfaces.offset[slot], wi
-        )
-        push(rays, slot, counters)
+            beta = wp.cw_mul(paths.beta[slot], weight)
+            finite = is_radiance(beta) and is_finite3(wi) and is_finite(pdf) and is_finite(guide_pdf_at)
+            if not (finite and guide_pdf_at >= 0.0):
+                wp.atomic_add(counters, NONFINITE_SCATTER, 1)
+                continue
+            if wp.max(beta) == 0.0:
+                continue
+            eta = float(1.0)
+            if wp.static(transmission):
+                eta = paths.eta[slot] * proposals.eta[slot]
+                paths.eta[slot] = eta
+            survival = float(1.0)
+            if wp.static(roulette):
+                if depth + 1 >= rr_depth:
+                    survival = survival_probability(beta, eta)
+                    u = draw(seed, paths.pixel[slot], paths.sample[slot], depth, PURPOSE_BSDF)
+                    if u[3] >= survival:
+                        continue
+                    beta /= survival
+            if wp.static(bool(records)):
+                row = record_row(rows, tile, slot)
+                if row >= 0:
+                    wo = -paths.direction[slot]
+                    record_scattering(
+                        rows, row, depth, surfaces, slot, wo, wi, pdf, guide_pdf_at, proposals, weight, survival
+                    )
+            paths.beta[slot] = beta
+            paths.direction[slot] = wi
+            paths.pdf[slot] = pdf
+            if wp.static(media):
+                paths.medium[slot] = medium_towards(surfaces.media[slot], surfaces.geometric_normal[slot], wi)
+            paths.origin[slot] = spawn_origin(
+                surfaces.position[slot], surfaces.geometric_normal[slot], surfaces.offset[slot], wi
+            )
+            push(rays, slot, counters)
 
     return resolve_directions

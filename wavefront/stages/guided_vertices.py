@@ -12,7 +12,7 @@ from wavefront.bsdf.dispatch import is_smooth, side_kind, transmits
 from wavefront.bsdf.roughness import make_roughness
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.proposals import Proposals
-from wavefront.queues import Paths, Queue, Surfaces, push, queue_size
+from wavefront.queues import Paths, Queue, Surfaces, push, queue_end, slot_at
 from wavefront.stage_kernel import stage_kernel
 from wavefront.texture import TextureTables
 
@@ -43,31 +43,29 @@ def make_guided_vertices(
         guided: Queue,
         counters: wp.array[wp.int32],
     ):
-        i = wp.tid()
-        if i >= queue_size(hits):
-            return
-        slot = hits.slots[i]
-        material = surfaces.material[slot]
-        normal = surfaces.shading_normal[slot]
-        wo = -paths.direction[slot]
-        delta = float(0.0)
-        cos_o = wp.dot(normal, wo)
-        smooth = is_smooth(materials.materials[material], cos_o)
-        uv = wp.vec2(0.0)
-        if wp.static(uvs):
-            uv = surfaces.uv[slot]
-        if wp.static(mixed_deltas):
-            if smooth:
-                delta = delta_probability(materials, textures, material, uv, normal, wo)
-                smooth = delta < 1.0
-            proposals.delta[slot] = delta
-        proposals.share[slot] = wp.where(smooth, share, 1.0)
-        if wp.static("roughness" in guide_inputs):
-            proposals.roughness[slot] = roughness_at(materials, textures, material, uv, cos_o)
-        if wp.static("transmits" in guide_inputs):
-            through = transmits(side_kind(materials.materials[material], cos_o))
-            proposals.transmits[slot] = wp.where(through, 1, 0)
-        if smooth:  # a BSDF of deltas alone needs no guide
-            push(guided, slot, counters)
+        for i in range(wp.tid(), queue_end(hits, wp.tid())):
+            slot = slot_at(hits, i)
+            material = surfaces.material[slot]
+            normal = surfaces.shading_normal[slot]
+            wo = -paths.direction[slot]
+            delta = float(0.0)
+            cos_o = wp.dot(normal, wo)
+            smooth = is_smooth(materials.materials[material], cos_o)
+            uv = wp.vec2(0.0)
+            if wp.static(uvs):
+                uv = surfaces.uv[slot]
+            if wp.static(mixed_deltas):
+                if smooth:
+                    delta = delta_probability(materials, textures, material, uv, normal, wo)
+                    smooth = delta < 1.0
+                proposals.delta[slot] = delta
+            proposals.share[slot] = wp.where(smooth, share, 1.0)
+            if wp.static("roughness" in guide_inputs):
+                proposals.roughness[slot] = roughness_at(materials, textures, material, uv, cos_o)
+            if wp.static("transmits" in guide_inputs):
+                through = transmits(side_kind(materials.materials[material], cos_o))
+                proposals.transmits[slot] = wp.where(through, 1, 0)
+            if smooth:  # a BSDF of deltas alone needs no guide
+                push(guided, slot, counters)
 
     return queue_guided_vertices

@@ -8,7 +8,7 @@ import warp as wp
 
 from wavefront.bsdf.maps import make_mapped_frame
 from wavefront.bsdf.tables import MaterialTables
-from wavefront.queues import Paths, Queue, Surfaces, queue_size
+from wavefront.queues import Paths, Queue, Surfaces, queue_end, slot_at
 from wavefront.stage_kernel import stage_kernel
 from wavefront.surface import Vertex
 from wavefront.texture import TextureTables
@@ -33,25 +33,23 @@ def make_perturb(textures: tuple[str, ...], uvs: bool, bumps: bool):
         # in and out
         surfaces: Surfaces,
     ):
-        i = wp.tid()
-        if i >= queue_size(rays):
-            return
-        slot = rays.slots[i]
-        material = surfaces.material[slot]
-        if material < 0:
-            return
-        vertex = Vertex()
-        vertex.geometric_normal = surfaces.geometric_normal[slot]
-        vertex.shading_normal = surfaces.shading_normal[slot]
-        vertex.tangent = surfaces.tangent[slot]
-        if wp.static(uvs):
-            vertex.uv = surfaces.uv[slot]
-        if wp.static(bumps):
-            vertex.uv_jacobian = surfaces.uv_jacobian[slot]
-        frame = mapped_frame(materials, textures, material, vertex, -paths.direction[slot])
-        surfaces.shading_normal[slot] = frame.normal
-        surfaces.tangent[slot] = frame.tangent
-        surfaces.base_normal[slot] = frame.base_normal
-        surfaces.terminator[slot] = frame.terminator
+        for i in range(wp.tid(), queue_end(rays, wp.tid())):
+            slot = slot_at(rays, i)
+            material = surfaces.material[slot]
+            if material < 0:
+                continue
+            vertex = Vertex()
+            vertex.geometric_normal = surfaces.geometric_normal[slot]
+            vertex.shading_normal = surfaces.shading_normal[slot]
+            vertex.tangent = surfaces.tangent[slot]
+            if wp.static(uvs):
+                vertex.uv = surfaces.uv[slot]
+            if wp.static(bumps):
+                vertex.uv_jacobian = surfaces.uv_jacobian[slot]
+            frame = mapped_frame(materials, textures, material, vertex, -paths.direction[slot])
+            surfaces.shading_normal[slot] = frame.normal
+            surfaces.tangent[slot] = frame.tangent
+            surfaces.base_normal[slot] = frame.base_normal
+            surfaces.terminator[slot] = frame.terminator
 
     return perturb_frames

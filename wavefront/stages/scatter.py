@@ -9,11 +9,13 @@ import warp as wp
 from wavefront.bsdf.dispatch import make_bsdf
 from wavefront.bsdf.frame import make_frame
 from wavefront.bsdf.tables import MaterialTables
+from wavefront.finite import is_finite, is_finite3, is_radiance
 from wavefront.medium import medium_towards
-from wavefront.queues import DEPTH, NONFINITE_SCATTER, Paths, Queue, Surfaces, push, queue_size
+from wavefront.queues import DEPTH, NONFINITE_SCATTER, Paths, Queue, Surfaces, push, queue_end, slot_at
 from wavefront.rng import PURPOSE_BSDF
 from wavefront.sampler import SAMPLERS
 from wavefront.stage_kernel import stage_kernel
+from wavefront.stages.ahead import make_fetch_textures
 from wavefront.surface import spawn_origin
 from wavefront.texture import TextureTables
 
@@ -37,11 +39,14 @@ def make_scatter(
     roulette: bool,
     media: bool = False,
     sampler: str = "independent",
+    ahead: bool = False,
 ):
     """Kernel of the stage; the arguments are the fields of `Features` of the same name."""
     _, sample_bsdf, _ = make_bsdf(bsdfs, mask, textures, tangents, bool(maps))
     frame_at, _ = make_frame(tangents, bool(maps))
     draw = SAMPLERS[sampler]
+
+    fetch_textures = make_fetch_textures(textures, uvs, ahead)
 
     @stage_kernel
     def scatter_paths(
@@ -57,53 +62,52 @@ def make_scatter(
         rays: Queue,
         counters: wp.array[wp.int32],
     ):
-        i = wp.tid()
-        if i >= queue_size(hits):
-            return
-        slot = hits.slots[i]
-        depth = counters[DEPTH]
+        for i in range(wp.tid(), queue_end(hits, wp.tid())):
+            fetch_textures(materials, textures, surfaces, hits, i)
+            slot = slot_at(hits, i)
+            depth = counters[DEPTH]
 
-        # propose
-        u = draw(seed, paths.pixel[slot], paths.sample[slot], depth, PURPOSE_BSDF)
-        uv = wp.vec2(0.0)
-        if wp.static(uvs):
-            uv = surfaces.uv[slot]
-        bsdf = sample_bsdf(
-            materials,
-            textures,
-            surfaces.material[slot],
-            uv,
-            frame_at(surfaces, slot),
-            -paths.direction[slot],
-            wp.vec3(u[0], u[1], u[2]),
-        )
+            # propose
+            u = draw(seed, paths.pixel[slot], paths.sample[slot], depth, PURPOSE_BSDF)
+            uv = wp.vec2(0.0)
+            if wp.static(uvs):
+                uv = surfaces.uv[slot]
+            bsdf = sample_bsdf(
+                materials,
+                textures,
+                surfaces.material[slot],
+                uv,
+                frame_at(surfaces, slot),
+                -paths.direction[slot],
+                wp.vec3(u[0], u[1], u[2]),
+            )
 
-        # resolve
-        beta = wp.cw_mul(paths.beta[slot], bsdf.weight)
-        if not (wp.isfinite(beta) and wp.isfinite(bsdf.wi) and wp.isfinite(bsdf.pdf) and wp.min(beta) >= 0.0):
-            wp.atomic_add(counters, NONFINITE_SCATTER, 1)
-            return
-        if wp.max(beta) == 0.0:
-            return
-        eta = float(1.0)
-        if wp.static(transmission):
-            eta = paths.eta[slot] * bsdf.eta
-            paths.eta[slot] = eta
-        if wp.static(roulette):
-            if depth + 1 >= rr_depth:
-                survival = survival_probability(beta, eta)
-                if u[3] >= survival:
-                    return
-                beta /= survival
-        wi = wp.normalize(bsdf.wi)
-        paths.beta[slot] = beta
-        paths.direction[slot] = wi
-        paths.pdf[slot] = bsdf.pdf
-        if wp.static(media):
-            paths.medium[slot] = medium_towards(surfaces.media[slot], surfaces.geometric_normal[slot], wi)
-        paths.origin[slot] = spawn_origin(
-            surfaces.position[slot], surfaces.geometric_normal[slot], surfaces.offset[slot], wi
-        )
-        push(rays, slot, counters)
+            # resolve
+            beta = wp.cw_mul(paths.beta[slot], bsdf.weight)
+            if not (is_radiance(beta) and is_finite3(bsdf.wi) and is_finite(bsdf.pdf)):
+                wp.atomic_add(counters, NONFINITE_SCATTER, 1)
+                continue
+            if wp.max(beta) == 0.0:
+                continue
+            eta = float(1.0)
+            if wp.static(transmission):
+                eta = paths.eta[slot] * bsdf.eta
+                paths.eta[slot] = eta
+            if wp.static(roulette):
+                if depth + 1 >= rr_depth:
+                    survival = survival_probability(beta, eta)
+                    if u[3] >= survival:
+                        continue
+                    beta /= survival
+            wi = wp.normalize(bsdf.wi)
+            paths.beta[slot] = beta
+            paths.direction[slot] = wi
+            paths.pdf[slot] = bsdf.pdf
+            if wp.static(media):
+                paths.medium[slot] = medium_towards(surfaces.media[slot], surfaces.geometric_normal[slot], wi)
+            paths.origin[slot] = spawn_origin(
+                surfaces.position[slot], surfaces.geometric_normal[slot], surfaces.offset[slot], wi
+            )
+            push(rays, slot, counters)
 
     return scatter_paths

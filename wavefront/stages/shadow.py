@@ -8,7 +8,7 @@ import warp as wp
 
 from wavefront.accel.geometry import Geometry
 from wavefront.accel.intersector import make_intersector
-from wavefront.queues import Paths, Queue, ShadowRays, queue_size
+from wavefront.queues import Paths, Queue, ShadowRays, queue_end, slot_at
 from wavefront.stage_kernel import stage_kernel
 
 
@@ -31,16 +31,16 @@ def make_shadow(
         # out
         paths: Paths,
     ):
-        i = wp.tid()
-        if i >= queue_size(shadow):
-            return
-        slot = shadow.slots[i]
-        blocked = bool(False)
-        if wp.static(streams):
-            blocked = shadow_rays.blocked[slot] == 1
-        else:
-            blocked = occluded(geometry, shadow_rays.origin[slot], shadow_rays.direction[slot], shadow_rays.t_max[slot])
-        if not blocked:
-            paths.L[slot] += shadow_rays.L[slot]
+        for i in range(wp.tid(), queue_end(shadow, wp.tid())):
+            slot = slot_at(shadow, i)
+            blocked = bool(False)
+            if wp.static(streams):
+                blocked = shadow_rays.blocked[slot] == 1
+            else:
+                blocked = occluded(
+                    geometry, shadow_rays.origin[slot], shadow_rays.direction[slot], shadow_rays.t_max[slot]
+                )
+            if not blocked:
+                paths.L[slot] += shadow_rays.L[slot]
 
     return trace_shadow_rays
