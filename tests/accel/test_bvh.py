@@ -106,11 +106,7 @@ def check_tree(hierarchy, lower, upper, first: int = 0, block: int = 4, max_bloc
     assert statistics.leaves == leaf.sum() == len(found.leaves)
     assert statistics.levels == found.levels <= bvh_module.MAX_LEVELS
     assert hierarchy.block_count == blocks.sum()
-    traced, refitted = 112 * len(found.nodes), 32 * len(found.nodes)
-    if block == 4:
-        traced += 160 * blocks.sum()
-        refitted += 8 * blocks.sum() + 4 * len(lower)
-    assert statistics.bytes == traced + refitted
+    assert statistics.bytes == 112 * len(found.nodes) + (160 * blocks.sum() if block == 4 else 0)
     assert statistics.seconds > 0.0
     areas, root = np.array([half_area(*b[0]) for b in found.boxes]), half_area(*found.nodes[-1][3])
     node_visits = block_visits = 0.0

@@ -63,11 +63,21 @@ def triangle_bounds(
 
 
 @wp.kernel
+def name_triangles(
+    order: wp.array[wp.int32], block_ranges: wp.array[wp.vec2i], first_triangle: int, first_block: int, bvh: Bvh
+):
+    """Numbers of the triangles of each block."""
+    i = wp.tid()
+    numbers = wp.vec4i(-1)
+    for k in range(block_ranges[i][1]):
+        numbers[k] = first_triangle + order[block_ranges[i][0] + k]
+    bvh.primitives[BLOCK_VECTORS * (first_block + i) + 9] = numbers
+
+
+@wp.kernel
 def write_blocks(
     points: wp.array[wp.vec3],
     indices: wp.array[wp.int32],
-    order: wp.array[wp.int32],
-    block_ranges: wp.array[wp.vec2i],
     first_triangle: int,
     first_block: int,
     # out
@@ -75,43 +85,34 @@ def write_blocks(
     lower: wp.array[wp.vec3],
     upper: wp.array[wp.vec3],
 ):
-    """Vertices and numbers of the triangles of each block, and its box."""
+    """Vertices of the triangles of each block, and its box."""
     i = wp.tid()
     block = BLOCK_VECTORS * (first_block + i)
     box_lower = wp.vec3(wp.inf)
     box_upper = wp.vec3(-wp.inf)
-    numbers = wp.vec4i(-1)
     for k in range(BLOCK):
         vertex = wp.vec3(wp.nan)
-        inside = k < block_ranges[i][1]
-        triangle = int(0)
-        if inside:
-            triangle = order[block_ranges[i][0] + k]
-            numbers[k] = first_triangle + triangle
+        primitive = bvh.primitives[block + 9][k]
+        triangle = primitive - first_triangle
         for j in range(3):
-            if inside:
+            if primitive >= 0:
                 vertex = points[indices[3 * triangle + j]]
                 box_lower = wp.min(box_lower, vertex)
                 box_upper = wp.max(box_upper, vertex)
             for axis in range(3):
                 bvh.blocks[block + 3 * j + axis][k] = vertex[axis]
-    bvh.primitives[block + 9] = numbers
     lower[i] = box_lower
     upper[i] = box_upper
 
 
 @wp.kernel
-def name_boxes(
-    order: wp.array[wp.int32],
-    block_ranges: wp.array[wp.vec2i],
-    # also out
-    links: wp.array[Children],
-):
-    """From the links of blocks of one box to those of the boxes themselves."""
-    i = wp.tid()
+def name_boxes(order: wp.array[wp.int32], block_ranges: wp.array[wp.vec2i], first_box: int, first_node: int, bvh: Bvh):
+    """From the links of blocks of one box, the first of them `first_box`, to those of the boxes themselves."""
+    node = NODE_VECTORS * (first_node + wp.tid())
     for k in range(WIDTH):
-        if links[i][k] < 0 and links[i][k] != EMPTY:
-            links[i][k] = ~order[block_ranges[~links[i][k]][0]]
+        link = bvh.links[node + 2 + k // 4][k % 4]
+        if link < 0 and link != EMPTY:
+            bvh.links[node + 2 + k // 4][k % 4] = ~(first_box + order[block_ranges[~link - first_box][0]])
 
 
 @wp.kernel
@@ -250,7 +251,7 @@ class Statistics:
         sah_cost: Expected nodes and blocks of leaves that a random line which meets the root's box visits, weighted by
             `NODE_COST` and `BLOCK_COST`.
         node_visits, block_visits: The same apart and without weights.
-        bytes: Of device memory that stays: tables, and what refitting reads.
+        bytes: Of its part of the tables.
         seconds: To build it.
     """
 
@@ -276,7 +277,8 @@ class _Hierarchy:
     """What hierarchies over triangles and over boxes have in common."""
 
     def __init__(self, wide: WideTree, max_blocks: int, device):
-        self.wide, self.max_blocks, self.device = wide, max_blocks, device
+        self.wide: WideTree | None = wide  # until it has its place in tables, which say the same
+        self.levels, self.max_blocks, self.device = wide.levels, max_blocks, device
         self.primitive_count, self.block_count = wide.order.shape[0], wide.block_ranges.shape[0]
         self.first_node = self.first_block = 0
         self.bvh: Bvh | None = None
@@ -284,17 +286,19 @@ class _Hierarchy:
 
     @property
     def node_count(self) -> int:
-        return self.wide.levels[-1]
+        return self.levels[-1]
 
     def _place(self, bvh: Bvh, first_node: int, first_block: int) -> None:
         self.bvh, self.first_node, self.first_block = bvh, first_node, first_block
         inputs = [self.wide.links, first_node, first_block * self.max_blocks, bvh]
         wp.launch(write_links, self.node_count, inputs=inputs, device=self.device)
+        self._name()
+        self.wide = None
 
     def _fit(self, lower: wp.array, upper: wp.array) -> None:
         """Fits nodes to the boxes of blocks."""
         boxes = [wp.empty(self.node_count, dtype=wp.vec3, device=self.device) for _ in range(2)]
-        for first, end in reversed(list(itertools.pairwise(self.wide.levels))):
+        for first, end in reversed(list(itertools.pairwise(self.levels))):
             inputs = [self.bvh, lower, upper, self.max_blocks, self.first_block, self.first_node, first, *boxes]
             wp.launch(fit_nodes, end - first, inputs=inputs, device=self.device)
 
@@ -320,11 +324,11 @@ class _Hierarchy:
             primitives=self.primitive_count,
             nodes=self.node_count,
             leaves=int(leaves.sum()),
-            levels=len(self.wide.levels) - 1,
+            levels=len(self.levels) - 1,
             sah_cost=NODE_COST * node_visits + BLOCK_COST * block_visits,
             node_visits=node_visits,
             block_visits=block_visits,
-            bytes=16 * vectors + sum(a.capacity for a in (self.wide.links, self.wide.block_ranges, self.wide.order)),
+            bytes=16 * vectors,
             seconds=self.build_seconds,
         )
 
@@ -353,6 +357,10 @@ class TriangleBvh(_Hierarchy):
         wp.synchronize_device(device)
         self.build_seconds = time.perf_counter() - begin
 
+    def _name(self) -> None:
+        inputs = [self.wide.order, self.wide.block_ranges, self.first_triangle, self.first_block, self.bvh]
+        wp.launch(name_triangles, self.block_count, inputs=inputs, device=self.device)
+
     def refit(self, points: wp.array) -> None:
         """Moves the vertices and fits the boxes to them; which triangles are together stays.
 
@@ -360,7 +368,7 @@ class TriangleBvh(_Hierarchy):
             points: As many as before, in the same order.
         """
         boxes = [wp.empty(self.block_count, dtype=wp.vec3, device=self.device) for _ in range(2)]
-        inputs = [points, self.indices, self.wide.order, self.wide.block_ranges, self.first_triangle, self.first_block]
+        inputs = [points, self.indices, self.first_triangle, self.first_block]
         wp.launch(write_blocks, self.block_count, inputs=inputs, outputs=[self.bvh, *boxes], device=self.device)
         self._fit(*boxes)
 
@@ -380,11 +388,6 @@ class BoxBvh(_Hierarchy):
         begin = time.perf_counter()
         device = lower.device
         super().__init__(_topology(lower, upper, 1, 1), 1, device)
-        wide, none = self.wide, wp.empty(0, dtype=wp.int32, device=device)
-        wp.launch(
-            name_boxes, self.node_count, inputs=[wide.order, wide.block_ranges], outputs=[wide.links], device=device
-        )
-        self.wide = dataclasses.replace(wide, block_ranges=none, order=none)
         self.first_box = first_box
         if alone:
             place([(self, lower, upper)])
@@ -393,6 +396,10 @@ class BoxBvh(_Hierarchy):
 
     def _place(self, bvh: Bvh, first_node: int, first_block: int) -> None:
         super()._place(bvh, first_node, self.first_box)
+
+    def _name(self) -> None:
+        inputs = [self.wide.order, self.wide.block_ranges, self.first_box, self.first_node, self.bvh]
+        wp.launch(name_boxes, self.node_count, inputs=inputs, device=self.device)
 
     def refit(self, lower: wp.array, upper: wp.array) -> None:
         """Moves the boxes; which are together stays."""
@@ -405,7 +412,7 @@ def place(hierarchies: list[tuple]) -> Bvh:
     The root of each is its `first_node`.
 
     Args:
-        hierarchies: Each with the arguments of its `refit`; at least one.
+        hierarchies: Each with the arguments of its `refit`; at least one, and none that has a place.
     """
     device = hierarchies[0][0].device
     nodes = sum(h.node_count for h, *_ in hierarchies)
