@@ -300,3 +300,10 @@ def test_warnings():
     assert validate(scene) == ["groups[0]: no instance puts 'a' into the scene"]
     scene.instances, scene.shapes = [d.Instance(group="a")], []
     assert validate(scene) == []
+
+
+def test_the_reference_traversal_finds_the_same():
+    """But for edges, which rounding decides, and for roundings that diffuse bounces enlarge."""
+    image, reference = (Renderer(garden(nee=False), threads=1, accel=accel).render(spp=2) for accel in ("bvh", "mesh"))
+    assert image.max() > 0.0
+    assert (np.abs(image - reference) <= 1e-3 * (1.0 + np.abs(reference))).mean() > 0.97

@@ -241,7 +241,7 @@ class _Upload:
                 else:  # leaves of 2 triangles traced fastest of 1, 2, 4 and 8 on the CPU device
                     mesh = wp.Mesh(points, indices, bvh_constructor="sah", bvh_leaf_size=2)
                     self.keep_alive.append(mesh)
-                    part.group.mesh, part.group.root = mesh.id, 0
+                    part.group.mesh, part.group.root, part.group.first_triangle = mesh.id, 0, part.first_triangle
             if part.sphere_count:
                 boxes = sphere_boxes(part.spheres)
                 add_boxes(part.group, "sphere_root", boxes, part.first_sphere)
