@@ -171,7 +171,7 @@ def estimates(w, sigma, repeats=40, pixels=1 << 14) -> tuple[np.ndarray, np.ndar
             noise = np.where(rng.random(pixels) < 0.1, 3.0, -1.0 / 3.0)
             L = np.repeat((5.0 + spread * noise)[:, None], 3, axis=1).astype(np.float32)
             film.begin_pass(weight)
-            launch(make_accumulate(True, True), pixels, paths(pixels, L=L), tile, pixels, film.arrays, counters.array)
+            launch(make_accumulate(True, True), pixels, paths(pixels, L=L), tile, pixels, film.arrays, counters.struct)
             film.end_pass(1)
         means.append(film.image()[..., 0].ravel().astype(np.float64))
         variances.append(film.variance().ravel().astype(np.float64))

@@ -90,7 +90,7 @@ class VertexWorker(TraceWorker):
         scene = self.renderer.device_scene
         self.own.counters.zero_()
         inputs = [scene.materials, scene.textures, self.paths, self.surfaces, self.queues["hits"], 0.5]
-        outputs = [self.proposals, self.own["guided"], self.own.counters]
+        outputs = [self.proposals, self.own["guided"], self.own.counter_struct]
         wp.launch(self.look, dim=1, inputs=inputs, outputs=outputs, device=self.device)
         self.seen += int(self.own["guided"].count.numpy()[0])
         if self.seen == self.wanted:

@@ -15,7 +15,7 @@ from wavefront.features import Features
 from wavefront.guide import DIRECTIONS, LIGHTS, MIN_SAMPLE_WEIGHT, Guide, GuideContext
 from wavefront.integrator import Kernels, Tile, Worker, skipped_guided_arrays
 from wavefront.proposals import LightProposals, Proposals
-from wavefront.queues import Paths, allocate_struct
+from wavefront.queues import Paths, allocate_struct, make_counters
 from wavefront.recording import Recorder, RecordScratch, Rows, scratch_arrays
 from wavefront.scene import description
 from wavefront.scene.device import DeviceScene
@@ -82,7 +82,7 @@ class GuidedWorker(Worker):
         proposals, light_proposals, scratch = self.proposals, self.light_proposals, self.scratch
         rows = recorder.rows if recorder is not None else Rows()
         paths, surfaces, shadow_rays, tile = self.paths, self.surfaces, self.shadow_rays, self.tile
-        counters, seed = self.queues.counters, wp.uint64(arguments["seed"])
+        counters, seed = self.queues.counter_struct, wp.uint64(arguments["seed"])
         geometry, materials = device_scene.geometry, device_scene.materials
         textures, lights = device_scene.textures, device_scene.lights
         rays, hits, shadow, guided, lit, proposed, smooth = (
@@ -115,14 +115,15 @@ class GuidedWorker(Worker):
                 paths=paths,
                 surfaces=surfaces,
                 proposals=proposals,
-                counters=counters,
+                counters=self.queues.counters,
             )
         )
 
     def _commands_apart(self, kernels: Kernels, f: Features) -> None:
         """The stages that add radiance, adding it to arrays of their own instead: the same kernels, given path states
         that share all arrays but some."""
-        counters = wp.zeros_like(self.queues.counters)  # what they leave out is counted by those that add to the path
+        # What they leave out is counted by those that add to the path.
+        counters = make_counters(wp.zeros_like(self.queues.counters))
 
         def apart(L: wp.array, pdf: wp.array | None = None):
             paths = Paths()
@@ -139,7 +140,7 @@ class GuidedWorker(Worker):
         for stage in ("escaped", "emission"):
             for prefix, view in views.items():
                 inputs = [view if x is self.paths else x for x in self._arguments.get(stage, [])]
-                inputs = [counters if x is self.queues.counters else x for x in inputs]
+                inputs = [counters if x is self.queues.counter_struct else x for x in inputs]
                 self._command(f"record_{prefix}{stage}", getattr(kernels, stage), inputs)
         if kernels.shadow is not None:
             visible = apart(self.scratch.visible)

@@ -273,7 +273,7 @@ class Worker:
         rays, hits, escaped, emissive, shadow = (
             self.queues[name] for name in ("rays", "hits", "escaped", "emissive", "shadow")
         )
-        counters, totals, tile = self.queues.counters, self.queues.totals, self.tile
+        counters, totals, tile = self.queues.counter_struct, self.queues.totals, self.tile
         camera, window = make_camera(scene.camera, scene.film), make_window(scene.film)
         scale = FILTER_SCALES[features.filter](scene.film.filter)
         max_depth, rr_depth = scene.integrator.max_depth, scene.integrator.rr_depth or 0

@@ -50,6 +50,16 @@ TILE_FIELDS = 6
 
 
 @wp.struct
+class Counters:
+    """What the stages of a worker count.
+
+    In a struct, because Warp compiles a kernel with an array among its own arguments twice for the CPU device.
+    """
+
+    values: wp.array[wp.int32]
+
+
+@wp.struct
 class Queue:
     """Indices of slots; `count` may exceed the capacity after an overflow, which sets a status bit."""
 
@@ -89,12 +99,12 @@ def slot_at(queue: Queue, i: int) -> int:
 
 
 @wp.func
-def push(queue: Queue, slot: int, counters: wp.array[wp.int32]):
+def push(queue: Queue, slot: int, counters: Counters):
     index = wp.atomic_add(queue.count, 0, 1)
     if index < queue.slots.shape[0]:
         queue.slots[index] = slot
     else:
-        wp.atomic_or(counters, STATUS, STATUS_QUEUE_OVERFLOW)
+        wp.atomic_or(counters.values, STATUS, STATUS_QUEUE_OVERFLOW)
 
 
 @wp.struct
@@ -157,6 +167,13 @@ def bytes_per_slot(struct: type, skip: tuple[str, ...] = ()) -> int:
     return sum(wp.types.type_size_in_bytes(v.type.dtype) for name, v in struct.vars.items() if name not in skip)
 
 
+def make_counters(values: wp.array) -> Counters:
+    """The argument of stages."""
+    counters = Counters()
+    counters.values = values
+    return counters
+
+
 class QueueSet:
     """The queues of one worker and the counters they share.
 
@@ -181,6 +198,7 @@ class QueueSet:
     def __init__(self, capacity: int, device: str, names: tuple[str, ...]):
         self.capacity = capacity
         self.counters = wp.zeros(COUNTER_COUNT, dtype=wp.int32, device=device)
+        self.counter_struct = make_counters(self.counters)
         self.totals = wp.zeros(TOTAL_COUNT, dtype=wp.int64, device=device)
         self.queues = {}
         for name, index in self.INDEX.items():

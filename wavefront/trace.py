@@ -153,7 +153,7 @@ class TraceWorker(Worker):
             )
         }
         if f.light_sampling:
-            arguments = [*tables, self.paths, self.surfaces, wp.uint64(renderer.seed), self.queues.counters]
+            arguments = [*tables, self.paths, self.surfaces, wp.uint64(renderer.seed), self.queues.counter_struct]
             arguments += [self.light_index, self.light_sample]
             self.inspectors["direct"] = (make_inspect_light(f.lights, f.light_textures, f.sampler), arguments)
         wp.force_load(device, modules=[kernel.module for kernel, _ in self.inspectors.values()])

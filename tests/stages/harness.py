@@ -63,6 +63,7 @@ class Counters:
 
     def __init__(self, depth: int = 0):
         self.array = wp.zeros(queues.COUNTER_COUNT, dtype=wp.int32, device=DEVICE)
+        self.struct = queues.make_counters(self.array)
         self.totals = wp.zeros(queues.TOTAL_COUNT, dtype=wp.int64, device=DEVICE)
         self.array.numpy()[queues.DEPTH] = depth  # on the CPU device the host sees it in place
         self.storage = {}

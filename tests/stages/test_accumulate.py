@@ -19,7 +19,7 @@ def accumulate(L, film, tile=TILE, variance=True, weighted=False):
     p, counters = paths(len(L), L=L), Counters()
     tile = array(np.array(tile, np.int32), wp.int32)
     # More threads than pixels in the tile, as in a captured graph.
-    launch(make_accumulate(variance, weighted), len(L), p, tile, film.width, film.arrays, counters.array)
+    launch(make_accumulate(variance, weighted), len(L), p, tile, film.width, film.arrays, counters.struct)
     return counters
 
 
@@ -90,7 +90,7 @@ def test_drain_counts_and_empties_the_rays():
     counters.array.numpy()[:] = np.arange(10, 10 + queues.COUNTER_COUNT)
     counters.totals.numpy()[:] = (2**40, 5, 7)
     before = counters.array.numpy().copy()
-    launch(drain_rays, 1, counters.array, counters.totals)
+    launch(drain_rays, 1, counters.struct, counters.totals)
     assert counters.totals.numpy().tolist() == [2**40 + 10, 5 + before[queues.SHADOW], 7]
     before[queues.RAYS] = 0
     np.testing.assert_array_equal(counters.array.numpy(), before)
@@ -102,7 +102,7 @@ def test_advance(rays):
     counters.array.numpy()[:] = np.arange(10, 10 + queues.COUNTER_COUNT)
     counters.array.numpy()[queues.RAYS] = rays
     expected = counters.array.numpy().copy()
-    launch(advance_bounce, 1, counters.array)
+    launch(advance_bounce, 1, counters.struct)
     expected[[queues.HITS, queues.ESCAPED, queues.EMISSIVE, queues.SHADOW]] = 0
     expected[queues.DEPTH] += 1
     expected[queues.CONTINUE] = 1 if rays else 0

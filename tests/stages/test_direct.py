@@ -51,7 +51,7 @@ def direct(n, slots=None, wo=WO, beta=BETA, material=0, capacity=None, radiance=
     )
     kernel = make_direct(("conductor", "diffuse"), False, (), ("constant", "triangle"), (), False, False, ())
     arguments = [scene.geometry, table, no_textures(), tables, p, s, hits, wp.uint64(SEED)]
-    launch(kernel, n, *arguments, rays, shadow, counters.array)
+    launch(kernel, n, *arguments, rays, shadow, counters.struct)
     return rays, counters
 
 

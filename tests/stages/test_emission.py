@@ -21,7 +21,7 @@ def escape(pdf, beta=BETA, radiance=(1.0, 2.0, 3.0), sampling=True, slots=None):
     p = paths(n, pdf=pdf, beta=beta, L=0.125)
     tables = lights([{"pmf": 0.75}, {"pmf": 0.25}], [(9.0, 9.0, 9.0), radiance], environment=1)
     queue = counters.queue("escaped", range(n) if slots is None else slots)
-    launch(make_escaped(("constant",), sampling), 16, tables, p, queue, counters.array)
+    launch(make_escaped(("constant",), sampling), 16, tables, p, queue, counters.struct)
     return p.L.numpy(), counters
 
 
@@ -74,7 +74,7 @@ def emit(light, pdf, origin=(0.1, -0.2, 0.3), target=None, normal=None, beta=BET
     rows = [{"kind": 0, "primitive": 0, "pmf": PMF[0]}, {"kind": 1, "primitive": 1, "pmf": PMF[1]}]
     queue = counters.queue("emissive", range(n) if slots is None else slots)
     kernel = make_emission(("constant", "sphere", "triangle"), (), sampling)
-    launch(kernel, 16, scene.geometry, lights(rows, RADIANCES), no_textures(), p, s, queue, counters.array)
+    launch(kernel, 16, scene.geometry, lights(rows, RADIANCES), no_textures(), p, s, queue, counters.struct)
     return p.L.numpy(), counters
 
 

@@ -35,7 +35,7 @@ def generate(kind, scale, fov_axis="x", transmission=False, tile=TILE, camera=No
     counters.array.numpy()[:] = 5
     arguments = [record, array(np.array(tile, np.int32), wp.int32), make_window(film), scale, wp.uint64(SEED)]
     kernel = make_generate(camera_kind(camera), kind, transmission)
-    launch(kernel, capacity, *arguments, p, rays, counters.array, counters.totals)
+    launch(kernel, capacity, *arguments, p, rays, counters.struct, counters.totals)
     return p, rays, counters
 
 

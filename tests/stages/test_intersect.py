@@ -60,7 +60,7 @@ def trace(
     s = surfaces(n, material=99, light=99)
     rays = counters.queue("rays", range(n) if slots is None else slots)
     out = [counters.queue(name, capacity=capacity) for name in ("hits", "escaped", "emissive")]
-    inputs = [scene.geometry, p, rays, RayHits(), max_depth, s, *out, counters.array]
+    inputs = [scene.geometry, p, rays, RayHits(), max_depth, s, *out, counters.struct]
     launch(make_intersect(True, True, **features), 16, *inputs)
     return s, counters
 

@@ -23,7 +23,7 @@ from wavefront.scene import description as d
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def push_kernel(queue: Queue, counters: wp.array(dtype=wp.int32), sizes: wp.array(dtype=wp.int32)):
+def push_kernel(queue: Queue, counters: queues.Counters, sizes: wp.array(dtype=wp.int32)):
     i = wp.tid()
     push(queue, 100 + i, counters)
     sizes[i] = queue_size(queue)
@@ -35,7 +35,7 @@ def test_push(capacity):
     counters = Counters()
     queue = counters.queue("hits", capacity=capacity)
     sizes = wp.zeros(12, dtype=wp.int32, device=DEVICE)
-    launch(push_kernel, 12, queue, counters.array, sizes)
+    launch(push_kernel, 12, queue, counters.struct, sizes)
     kept = min(12, capacity)
     assert sorted(counters.storage["hits"].numpy()[:kept]) == list(range(100, 100 + kept))
     assert (counters.storage["hits"].numpy()[kept:] == -7).all()

@@ -34,7 +34,7 @@ def scatter(n, material, depth=0, rr_depth=None, beta=1.0, eta=1.0, wo=WO, slots
     kernel = make_scatter(
         ("conductor", "dielectric", "diffuse"), False, (), False, False, (), True, rr_depth is not None
     )
-    launch(kernel, n, table, no_textures(), s, hits, rr_depth or 0, wp.uint64(SEED), p, rays, counters.array)
+    launch(kernel, n, table, no_textures(), s, hits, rr_depth or 0, wp.uint64(SEED), p, rays, counters.struct)
     return p, counters
 
 

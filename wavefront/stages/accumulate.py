@@ -8,7 +8,16 @@ import warp as wp
 
 from wavefront.film import FilmArrays, luminance
 from wavefront.finite import is_finite3
-from wavefront.queues import NONFINITE_ACCUMULATE, SAMPLE_COUNT, TILE_HEIGHT, TILE_WIDTH, TILE_X, TILE_Y, Paths
+from wavefront.queues import (
+    NONFINITE_ACCUMULATE,
+    SAMPLE_COUNT,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    TILE_X,
+    TILE_Y,
+    Counters,
+    Paths,
+)
 from wavefront.stage_kernel import stage_kernel
 
 
@@ -28,7 +37,7 @@ def make_accumulate(variance: bool, weighted: bool = False):
         film_width: int,
         # out
         film: FilmArrays,
-        counters: wp.array[wp.int32],
+        counters: Counters,
     ):
         local = wp.tid()
         if local >= tile[TILE_WIDTH] * tile[TILE_HEIGHT]:
@@ -50,7 +59,7 @@ def make_accumulate(variance: bool, weighted: bool = False):
         for s in range(samples):
             L = paths.L[local * samples + s]
             if not is_finite3(L):  # each contribution was finite, their sum overflowed
-                wp.atomic_add(counters, NONFINITE_ACCUMULATE, 1)
+                wp.atomic_add(counters.values, NONFINITE_ACCUMULATE, 1)
                 L = wp.vec3(0.0)
             contribution = wp.vec3d(wp.float64(L[0]), wp.float64(L[1]), wp.float64(L[2]))
             if wp.static(weighted):

@@ -3,13 +3,13 @@
 import warp as wp
 
 from wavefront.finite import is_radiance
-from wavefront.queues import Paths
+from wavefront.queues import Counters, Paths
 
 
 @wp.func
-def add_radiance(paths: Paths, slot: int, L: wp.vec3, counters: wp.array[wp.int32], nonfinite_counter: int):
+def add_radiance(paths: Paths, slot: int, L: wp.vec3, counters: Counters, nonfinite_counter: int):
     """Adds `L` to the path's radiance; a non-finite or negative contribution is counted and left out."""
     if is_radiance(L):
         paths.L[slot] += L
     else:
-        wp.atomic_add(counters, nonfinite_counter, 1)
+        wp.atomic_add(counters.values, nonfinite_counter, 1)

@@ -12,7 +12,18 @@ from wavefront.bsdf.tables import MaterialTables
 from wavefront.finite import is_radiance
 from wavefront.light.mis import power_heuristic
 from wavefront.light.tables import DELTA, LightTables
-from wavefront.queues import DEPTH, NONFINITE_DIRECT, Paths, Queue, ShadowRays, Surfaces, push, queue_end, slot_at
+from wavefront.queues import (
+    DEPTH,
+    NONFINITE_DIRECT,
+    Counters,
+    Paths,
+    Queue,
+    ShadowRays,
+    Surfaces,
+    push,
+    queue_end,
+    slot_at,
+)
 from wavefront.stage_kernel import stage_kernel
 from wavefront.stages.ahead import make_fetch_textures
 from wavefront.stages.light_proposal import make_light_proposal
@@ -54,7 +65,7 @@ def make_direct(
         # out
         shadow_rays: ShadowRays,
         shadow: Queue,
-        counters: wp.array[wp.int32],
+        counters: Counters,
     ):
         for i in range(wp.tid(), queue_end(hits, wp.tid())):
             fetch_textures(materials, textures, surfaces, hits, i)
@@ -65,7 +76,7 @@ def make_direct(
 
             # propose and evaluate
             proposal = propose_light(
-                geometry, materials, textures, lights, paths, surfaces, slot, seed, counters[DEPTH]
+                geometry, materials, textures, lights, paths, surfaces, slot, seed, counters.values[DEPTH]
             )
             light = proposal.light
             bsdf = proposal.bsdf
@@ -79,7 +90,7 @@ def make_direct(
                     weight *= power_heuristic(light.pdf, bsdf.pdf)
             L = weight * wp.cw_mul(paths.beta[slot], wp.cw_mul(bsdf.value, light.L))
             if not is_radiance(L):
-                wp.atomic_add(counters, NONFINITE_DIRECT, 1)
+                wp.atomic_add(counters.values, NONFINITE_DIRECT, 1)
                 continue
             if aim_shadow_ray(geometry, surfaces, slot, light, L, shadow_rays):
                 push(shadow, slot, counters)

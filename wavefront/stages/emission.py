@@ -10,7 +10,7 @@ from wavefront.accel.geometry import Geometry
 from wavefront.light.mis import power_heuristic
 from wavefront.light.sampling import make_light_sampler
 from wavefront.light.tables import AREA, LightTables
-from wavefront.queues import NONFINITE_EMISSION, Paths, Queue, Surfaces, queue_end, slot_at
+from wavefront.queues import NONFINITE_EMISSION, Counters, Paths, Queue, Surfaces, queue_end, slot_at
 from wavefront.stage_kernel import stage_kernel
 from wavefront.stages.contribution import add_radiance
 from wavefront.texture import TextureTables, make_eval_parameter
@@ -33,7 +33,7 @@ def make_emission(lights: tuple[str, ...], light_textures: tuple[str, ...], ligh
         surfaces: Surfaces,
         emissive: Queue,
         # out
-        counters: wp.array[wp.int32],
+        counters: Counters,
     ):
         for i in range(wp.tid(), queue_end(emissive, wp.tid())):
             slot = slot_at(emissive, i)

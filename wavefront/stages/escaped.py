@@ -10,7 +10,7 @@ from wavefront.light.envmap import envmap_storage, make_envmap
 from wavefront.light.mis import power_heuristic
 from wavefront.light.sun import in_sun
 from wavefront.light.tables import LightTables
-from wavefront.queues import NONFINITE_ESCAPED, Paths, Queue, queue_end, slot_at
+from wavefront.queues import NONFINITE_ESCAPED, Counters, Paths, Queue, queue_end, slot_at
 from wavefront.stage_kernel import stage_kernel
 from wavefront.stages.contribution import add_radiance
 from wavefront.warp_samples import cone_pdf, sphere_pdf
@@ -31,7 +31,7 @@ def make_escaped(escape_lights: tuple[str, ...], light_sampling: bool):
         paths: Paths,
         escaped: Queue,
         # out
-        counters: wp.array[wp.int32],
+        counters: Counters,
     ):
         for i in range(wp.tid(), queue_end(escaped, wp.tid())):
             slot = slot_at(escaped, i)

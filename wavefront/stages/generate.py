@@ -23,6 +23,7 @@ from wavefront.queues import (
     TILE_X,
     TILE_Y,
     TOTAL_PATHS,
+    Counters,
     Paths,
     Queue,
 )
@@ -56,7 +57,7 @@ def make_generate(camera_kind: str, filter_kind: str, transmission: bool, sample
         # out
         paths: Paths,
         rays: Queue,
-        counters: wp.array[wp.int32],
+        counters: Counters,
         totals: wp.array[wp.int64],
     ):
         slot = wp.tid()
@@ -65,13 +66,13 @@ def make_generate(camera_kind: str, filter_kind: str, transmission: bool, sample
         if slot >= count:
             return
         if slot == 0:
-            counters[RAYS] = count
-            counters[HITS] = 0
-            counters[ESCAPED] = 0
-            counters[EMISSIVE] = 0
-            counters[SHADOW] = 0
-            counters[DEPTH] = 0
-            counters[CONTINUE] = 1
+            counters.values[RAYS] = count
+            counters.values[HITS] = 0
+            counters.values[ESCAPED] = 0
+            counters.values[EMISSIVE] = 0
+            counters.values[SHADOW] = 0
+            counters.values[DEPTH] = 0
+            counters.values[CONTINUE] = 1
             totals[TOTAL_PATHS] += wp.int64(count)
         local = slot // samples
         # Pixels are numbered over the whole film, so that those of a window draw the same random numbers.

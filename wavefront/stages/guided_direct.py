@@ -13,7 +13,7 @@ from wavefront.accel.geometry import Geometry
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.light.tables import LightTables
 from wavefront.proposals import LightProposals
-from wavefront.queues import DEPTH, Paths, Queue, ShadowRays, Surfaces, push, queue_end, slot_at
+from wavefront.queues import DEPTH, Counters, Paths, Queue, ShadowRays, Surfaces, push, queue_end, slot_at
 from wavefront.stage_kernel import stage_kernel
 from wavefront.stages.ahead import make_fetch_textures
 from wavefront.stages.light_proposal import make_light_proposal
@@ -54,13 +54,13 @@ def make_guided_direct(
         light_proposals: LightProposals,
         shadow_rays: ShadowRays,  # L: f |cos| L, with what media leave of it
         lit: Queue,
-        counters: wp.array[wp.int32],
+        counters: Counters,
     ):
         for i in range(wp.tid(), queue_end(guided, wp.tid())):
             fetch_textures(materials, textures, surfaces, guided, i)
             slot = slot_at(guided, i)
             proposal = propose_light(
-                geometry, materials, textures, lights, paths, surfaces, slot, seed, counters[DEPTH]
+                geometry, materials, textures, lights, paths, surfaces, slot, seed, counters.values[DEPTH]
             )
             light = proposal.light
             bsdf = proposal.bsdf

@@ -11,7 +11,7 @@ from wavefront.bsdf.dispatch import make_bsdf
 from wavefront.bsdf.frame import make_frame
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.proposals import Proposals
-from wavefront.queues import NONFINITE_SCATTER, Paths, Queue, Surfaces, queue_end, slot_at
+from wavefront.queues import NONFINITE_SCATTER, Counters, Paths, Queue, Surfaces, queue_end, slot_at
 from wavefront.stage_kernel import stage_kernel
 from wavefront.texture import TextureTables
 
@@ -43,7 +43,7 @@ def make_guided_evaluate(
         # in and out
         proposals: Proposals,
         # out
-        counters: wp.array[wp.int32],
+        counters: Counters,
     ):
         for i in range(wp.tid(), queue_end(proposed, wp.tid())):
             slot = slot_at(proposed, i)
@@ -67,7 +67,7 @@ def make_guided_evaluate(
                 if wp.static(transmission):
                     eta = crossed_eta(materials, material, frame, wo, wi)
             elif length2 != 0.0:  # NaN, or no unit vector
-                wp.atomic_add(counters, NONFINITE_SCATTER, 1)
+                wp.atomic_add(counters.values, NONFINITE_SCATTER, 1)
             proposals.weight[slot] = weight
             proposals.bsdf_pdf[slot] = pdf
             if wp.static(transmission):

@@ -9,7 +9,7 @@ import warp as wp
 from wavefront.finite import is_finite, is_radiance
 from wavefront.light.mis import power_heuristic
 from wavefront.proposals import LightProposals, Proposals, make_bsdf_share, make_scatter_pdf
-from wavefront.queues import NONFINITE_DIRECT, Paths, Queue, ShadowRays, push, queue_end, slot_at
+from wavefront.queues import NONFINITE_DIRECT, Counters, Paths, Queue, ShadowRays, push, queue_end, slot_at
 from wavefront.recording import RecordScratch
 from wavefront.stage_kernel import stage_kernel
 
@@ -35,7 +35,7 @@ def make_guided_light(mixed_deltas: bool, guide_pdf: bool, recorded: bool):
         # out
         scratch: RecordScratch,
         shadow: Queue,
-        counters: wp.array[wp.int32],
+        counters: Counters,
     ):
         for i in range(wp.tid(), queue_end(lit, wp.tid())):
             slot = slot_at(lit, i)
@@ -47,13 +47,13 @@ def make_guided_light(mixed_deltas: bool, guide_pdf: bool, recorded: bool):
                     guide_pdf_at = light_proposals.guide_pdf[slot]
                 other = scatter_pdf(bsdf_share(proposals, slot), light_proposals.bsdf_pdf[slot], guide_pdf_at)
                 if not (is_finite(other) and other >= 0.0):
-                    wp.atomic_add(counters, NONFINITE_DIRECT, 1)
+                    wp.atomic_add(counters.values, NONFINITE_DIRECT, 1)
                     continue
                 weight *= power_heuristic(pdf, other)
             arriving = shadow_rays.L[slot]
             L = weight * wp.cw_mul(paths.beta[slot], arriving)
             if not is_radiance(L):
-                wp.atomic_add(counters, NONFINITE_DIRECT, 1)
+                wp.atomic_add(counters.values, NONFINITE_DIRECT, 1)
                 continue
             if wp.static(recorded):
                 scratch.light[slot] = weight * arriving

@@ -11,7 +11,7 @@ from wavefront.bsdf.dispatch import make_bsdf
 from wavefront.bsdf.frame import make_frame
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.proposals import TECHNIQUE_BSDF, TECHNIQUE_GUIDE, Proposals, make_bsdf_share
-from wavefront.queues import DEPTH, Paths, Queue, Surfaces, push, queue_end, slot_at
+from wavefront.queues import DEPTH, Counters, Paths, Queue, Surfaces, push, queue_end, slot_at
 from wavefront.rng import PURPOSE_BSDF, PURPOSE_TECHNIQUE
 from wavefront.sampler import SAMPLERS
 from wavefront.stage_kernel import stage_kernel
@@ -52,14 +52,14 @@ def make_guided_propose(
         # out
         proposed: Queue,  # to be filled by the guide
         smooth: Queue,  # directions for which the guide's density is needed
-        counters: wp.array[wp.int32],
+        counters: Counters,
     ):
         for i in range(wp.tid(), queue_end(hits, wp.tid())):
             fetch_textures(materials, textures, surfaces, hits, i)
             slot = slot_at(hits, i)
             pixel = paths.pixel[slot]
             sample = paths.sample[slot]
-            depth = counters[DEPTH]
+            depth = counters.values[DEPTH]
             share = bsdf_share(proposals, slot)
             if share < 1.0:
                 choice = draw(seed, pixel, sample, depth, PURPOSE_TECHNIQUE)

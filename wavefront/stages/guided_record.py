@@ -11,7 +11,7 @@ import functools
 
 import warp as wp
 
-from wavefront.queues import DEPTH, Paths, Queue, queue_end, slot_at
+from wavefront.queues import DEPTH, Counters, Paths, Queue, queue_end, slot_at
 from wavefront.recording import RecordScratch, Rows, record_row
 from wavefront.stage_kernel import stage_kernel
 
@@ -42,7 +42,7 @@ def make_record_arrivals(taken: bool):
     def record_arrivals(
         rays: Queue,
         tile: wp.array[wp.int32],
-        counters: wp.array[wp.int32],
+        counters: Counters,
         # out
         paths: Paths,
         scratch: RecordScratch,
@@ -61,7 +61,7 @@ def make_record_arrivals(taken: bool):
             row = record_row(rows, tile, slot)
             if row < 0:
                 continue
-            depth = counters[DEPTH]
+            depth = counters.values[DEPTH]
             entry = wp.min(depth, rows.depth) * rows.count + row
             if depth <= rows.depth:
                 rows.arrival[entry] = emission
@@ -79,7 +79,7 @@ def make_record_arrivals(taken: bool):
 def record_direct_light(
     shadow: Queue,
     tile: wp.array[wp.int32],
-    counters: wp.array[wp.int32],
+    counters: Counters,
     # out
     paths: Paths,
     scratch: RecordScratch,
@@ -95,5 +95,5 @@ def record_direct_light(
         paths.L[slot] += L
         row = record_row(rows, tile, slot)
         if row >= 0:
-            entry = wp.min(counters[DEPTH], rows.depth) * rows.count + row
+            entry = wp.min(counters.values[DEPTH], rows.depth) * rows.count + row
             rows.arrival[entry] += wp.cw_mul(rows.through[entry], scratch.light[slot])

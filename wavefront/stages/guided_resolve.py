@@ -10,7 +10,7 @@ import warp as wp
 from wavefront.finite import is_finite, is_finite3, is_radiance
 from wavefront.medium import medium_towards
 from wavefront.proposals import TECHNIQUE_GUIDE, Proposals, make_bsdf_share, make_scatter_pdf
-from wavefront.queues import DEPTH, NONFINITE_SCATTER, Paths, Queue, Surfaces, push, queue_end, slot_at
+from wavefront.queues import DEPTH, NONFINITE_SCATTER, Counters, Paths, Queue, Surfaces, push, queue_end, slot_at
 from wavefront.recording import Rows, record_row
 from wavefront.rng import PURPOSE_BSDF
 from wavefront.sampler import SAMPLERS
@@ -87,11 +87,11 @@ def make_guided_resolve(
         # out
         rays: Queue,
         rows: Rows,
-        counters: wp.array[wp.int32],
+        counters: Counters,
     ):
         for i in range(wp.tid(), queue_end(hits, wp.tid())):
             slot = slot_at(hits, i)
-            depth = counters[DEPTH]
+            depth = counters.values[DEPTH]
             share = bsdf_share(proposals, slot)
             wi = proposals.wi[slot]
             bsdf_pdf = proposals.bsdf_pdf[slot]
@@ -117,7 +117,7 @@ def make_guided_resolve(
             beta = wp.cw_mul(paths.beta[slot], weight)
             finite = is_radiance(beta) and is_finite3(wi) and is_finite(pdf) and is_finite(guide_pdf_at)
             if not (finite and guide_pdf_at >= 0.0):
-                wp.atomic_add(counters, NONFINITE_SCATTER, 1)
+                wp.atomic_add(counters.values, NONFINITE_SCATTER, 1)
                 continue
             if wp.max(beta) == 0.0:
                 continue

@@ -12,7 +12,7 @@ from wavefront.bsdf.dispatch import is_smooth, side_kind, transmits
 from wavefront.bsdf.roughness import make_roughness
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.proposals import Proposals
-from wavefront.queues import Paths, Queue, Surfaces, push, queue_end, slot_at
+from wavefront.queues import Counters, Paths, Queue, Surfaces, push, queue_end, slot_at
 from wavefront.stage_kernel import stage_kernel
 from wavefront.texture import TextureTables
 
@@ -41,7 +41,7 @@ def make_guided_vertices(
         # out
         proposals: Proposals,
         guided: Queue,
-        counters: wp.array[wp.int32],
+        counters: Counters,
     ):
         for i in range(wp.tid(), queue_end(hits, wp.tid())):
             slot = slot_at(hits, i)

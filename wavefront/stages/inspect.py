@@ -12,7 +12,7 @@ from wavefront.bsdf.frame import make_frame
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.light.sampling import LightSample, make_light_sampler, select_light
 from wavefront.light.tables import LightTables
-from wavefront.queues import DEPTH, Paths, Surfaces
+from wavefront.queues import DEPTH, Counters, Paths, Surfaces
 from wavefront.rng import PURPOSE_LIGHT
 from wavefront.sampler import SAMPLERS
 from wavefront.stage_kernel import stage_kernel
@@ -56,7 +56,7 @@ def make_inspect_light(lights: tuple[str, ...], light_textures: tuple[str, ...],
         paths: Paths,
         surfaces: Surfaces,
         seed: wp.uint64,
-        counters: wp.array[wp.int32],
+        counters: Counters,
         # out
         index: wp.array[wp.int32],
         sample: wp.array[LightSample],
@@ -64,7 +64,7 @@ def make_inspect_light(lights: tuple[str, ...], light_textures: tuple[str, ...],
         index[0] = -1
         cos_o = -wp.dot(surfaces.shading_normal[0], paths.direction[0])
         if is_smooth(materials.materials[surfaces.material[0]], cos_o):
-            u = draw(seed, paths.pixel[0], paths.sample[0], counters[DEPTH], PURPOSE_LIGHT)
+            u = draw(seed, paths.pixel[0], paths.sample[0], counters.values[DEPTH], PURPOSE_LIGHT)
             index[0] = select_light(lights, u[0])
             sample[0] = sample_light(lights, geometry, textures, surfaces.position[0], u)
 

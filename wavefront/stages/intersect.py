@@ -9,7 +9,7 @@ import warp as wp
 from wavefront.accel.geometry import INFINITE, Geometry, RayHits, hit_type
 from wavefront.accel.intersector import make_intersector
 from wavefront.medium import transmittance
-from wavefront.queues import DEPTH, Paths, Queue, Surfaces, push, queue_end, slot_at
+from wavefront.queues import DEPTH, Counters, Paths, Queue, Surfaces, push, queue_end, slot_at
 from wavefront.stage_kernel import stage_kernel
 from wavefront.stages.ahead import make_fetch_triangles
 from wavefront.surface import make_vertex
@@ -54,7 +54,7 @@ def make_intersect(
         hits: Queue,
         escaped: Queue,
         emissive: Queue,
-        counters: wp.array[wp.int32],
+        counters: Counters,
     ):
         for i in range(wp.tid(), queue_end(rays, wp.tid())):
             if wp.static(streams):
@@ -75,7 +75,7 @@ def make_intersect(
             if wp.static(media):
                 medium = geometry.camera_medium
                 start = origin
-                if counters[DEPTH] > 0:
+                if counters.values[DEPTH] > 0:
                     medium = paths.medium[slot]
                     start = surfaces.position[
                         slot
@@ -116,7 +116,7 @@ def make_intersect(
                     push(emissive, slot, counters)
                 surfaces.light[slot] = light
             # At the last vertex of the longest path only its emission counts.
-            if counters[DEPTH] + 1 < max_depth:
+            if counters.values[DEPTH] + 1 < max_depth:
                 push(hits, slot, counters)
 
     return closest_hits

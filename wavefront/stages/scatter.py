@@ -11,7 +11,7 @@ from wavefront.bsdf.frame import make_frame
 from wavefront.bsdf.tables import MaterialTables
 from wavefront.finite import is_finite, is_finite3, is_radiance
 from wavefront.medium import medium_towards
-from wavefront.queues import DEPTH, NONFINITE_SCATTER, Paths, Queue, Surfaces, push, queue_end, slot_at
+from wavefront.queues import DEPTH, NONFINITE_SCATTER, Counters, Paths, Queue, Surfaces, push, queue_end, slot_at
 from wavefront.rng import PURPOSE_BSDF
 from wavefront.sampler import SAMPLERS
 from wavefront.stage_kernel import stage_kernel
@@ -60,12 +60,12 @@ def make_scatter(
         paths: Paths,
         # out
         rays: Queue,
-        counters: wp.array[wp.int32],
+        counters: Counters,
     ):
         for i in range(wp.tid(), queue_end(hits, wp.tid())):
             fetch_textures(materials, textures, surfaces, hits, i)
             slot = slot_at(hits, i)
-            depth = counters[DEPTH]
+            depth = counters.values[DEPTH]
 
             # propose
             u = draw(seed, paths.pixel[slot], paths.sample[slot], depth, PURPOSE_BSDF)
@@ -85,7 +85,7 @@ def make_scatter(
             # resolve
             beta = wp.cw_mul(paths.beta[slot], bsdf.weight)
             if not (is_radiance(beta) and is_finite3(bsdf.wi) and is_finite(bsdf.pdf)):
-                wp.atomic_add(counters, NONFINITE_SCATTER, 1)
+                wp.atomic_add(counters.values, NONFINITE_SCATTER, 1)
                 continue
             if wp.max(beta) == 0.0:
                 continue
