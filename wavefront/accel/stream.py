@@ -47,7 +47,9 @@ _STREAM = """
     typedef int int4 __attribute__((ext_vector_type(4), aligned(16)));
     typedef unsigned char bytes8 __attribute__((ext_vector_type(8), aligned(8)));
     typedef bool bool8 __attribute__((ext_vector_type(8)));
+    typedef bool bool4 __attribute__((ext_vector_type(4)));
     constexpr int node_size = 4 * NODE_VECTORS, block_size = 4 * BLOCK_VECTORS;  // floats
+    constexpr bool any = ANY;  // whether any hit will do
     constexpr bool own_triangles = OWN_TRIANGLES, own_spheres = OWN_SPHERES;
     constexpr bool group_triangles = GROUP_TRIANGLES, group_spheres = GROUP_SPHERES;
     constexpr bool triangles = own_triangles || group_triangles, spheres = own_spheres || group_spheres;
@@ -207,13 +209,17 @@ _STREAM = """
                     const float4 weight_a = u / det, weight_b = v / det;
                     const float4 t = r.shear_z * (weight_a * az + weight_b * bz + (w / det) * cz);
                     const int4 met = (front | back) & (det != 0.0f) & (t > 0.0f) & (t <= r.t);
-                    if (!__builtin_reduce_or(met)) continue;
-                    for (int i = 0; i < 4; ++i) {
+                    if (any) {
+                        if (!__builtin_reduce_or(met & (t < r.t))) continue;
+                        r.primitive = 0;
+                        goto end;
+                    }
+                    // Mostly none or one: nothing to guess for each of the four.
+                    unsigned lanes = __builtin_bit_cast(unsigned char, __builtin_convertvector(met, bool4));
+                    for (; lanes != 0; lanes &= lanes - 1) {
+                        const int i = __builtin_ctz(lanes);
                         const int primitive = ((const int*)(block + 36))[i];
-                        if (met[i] && before(r, t[i], primitive)) {
-                            accept(r, t[i], weight_a[i], weight_b[i], primitive);
-                            FOUND
-                        }
+                        if (before(r, t[i], primitive)) accept(r, t[i], weight_a[i], weight_b[i], primitive);
                     }
                 }
             } else if (spheres && (!mixed || r.kind == SPHERE)) {
@@ -233,7 +239,7 @@ _STREAM = """
                     const int primitive = geometry.triangle_count + index;
                     if (t > 0.0f && before(r, t, primitive)) {
                         accept(r, t, 0.0f, 0.0f, primitive);
-                        FOUND
+                        if (any) goto end;
                     }
                 }
             } else if (instances) {
@@ -297,7 +303,7 @@ class Streams(NamedTuple):
 def make_streams(triangles: bool, spheres: bool, instances: tuple[str, ...] = ()) -> Streams:
     """Functions for the kinds of primitive in a scene, of which there must be some; as of `make_intersector`."""
 
-    def source(limit: str, found: str, result: str) -> str:
+    def source(limit: str, any_will_do: bool, result: str) -> str:
         text = _STREAM.replace("SORT\n", "\n                ".join(map(_layer, NETWORK)) + "\n")
         constants = {
             "IN_FLIGHT": IN_FLIGHT,
@@ -314,7 +320,7 @@ def make_streams(triangles: bool, spheres: bool, instances: tuple[str, ...] = ()
             "GROUP_TRIANGLES": int("triangles" in instances),
             "GROUP_SPHERES": int("spheres" in instances),
             "LIMIT": limit,
-            "FOUND": found,
+            "ANY": int(any_will_do),
             "RESULT": result,
         }
         for name, value in constants.items():
@@ -326,7 +332,7 @@ def make_streams(triangles: bool, spheres: bool, instances: tuple[str, ...] = ()
     @wp.func_native(
         source(
             f"{float(INFINITE)}f",
-            "",
+            False,
             f"""{{
                 const int slot = slots.data[r.index];
                 hits.primitive.data[slot] = r.primitive;
@@ -346,7 +352,7 @@ def make_streams(triangles: bool, spheres: bool, instances: tuple[str, ...] = ()
         hits: RayHits,
     ): ...
 
-    @wp.func_native(source("t_max.data[slot]", "goto end;", "blocked.data[slots.data[r.index]] = r.primitive >= 0;"))
+    @wp.func_native(source("t_max.data[slot]", True, "blocked.data[slots.data[r.index]] = r.primitive >= 0;"))
     def occluded(
         geometry: Geometry,
         slots: wp.array[wp.int32],
