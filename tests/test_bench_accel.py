@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
-from tools.accel_engines import Answer, Ours, Rays, WarpMesh
+from tools.accel_engines import Answer, Ours, Rays, WarpMesh, missing
 from tools.accel_rays import RayMaker, blob, from_scene, generated, soup
-from tools.bench_accel import differences, main
+from tools.bench_accel import differences, main, print_report
 
 SCENES = Path(__file__).parent.parent / "scenes"
 CORNELL_BOX = str(SCENES / "cornell-box.json")
@@ -241,3 +242,7 @@ def test_engines_that_are_missing(monkeypatch, capsys):
     assert main(["--engines", "stream,embree", "--sizes", "500", "--soup", "none"]) == 2
     error = capsys.readouterr().err.splitlines()[-1]
     assert "embreex is not installed" in error and "pip install '.[embree]'" in error
+    account = {"settings": {"device": "cpu", "threads": 1, "rounds": 1}, "cases": []}
+    account |= {"machine": dict.fromkeys(("cpu", "cores", "load", "system", "python"), "?") | {"versions": {}}}
+    print_report(account | {"left_out": {"embree": missing("embree", "cpu")}}, Console(width=200))
+    assert "pip install '.[embree]'" in capsys.readouterr().out  # brackets are no markup

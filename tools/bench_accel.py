@@ -278,10 +278,10 @@ def print_report(account: dict, console: Console) -> None:
     settings = account["settings"]
     console.print("{device}, {threads} threads, {rounds} rounds".format(**settings))
     for engine, reason in account["left_out"].items():
-        console.print(f"{engine} is left out: {reason}")
+        console.print(f"{engine} is left out: {reason}", markup=False)
     for case in account["cases"]:
         for note in case["notes"]:
-            console.print(f"{case['name']}: {note}")
+            console.print(f"{case['name']}: {note}", markup=False)
         console.print(build_table(case))
         console.print(query_table(case))
 
